@@ -20,9 +20,6 @@ from typing import Literal, Protocol
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
-
-from support.reference_merging import class_distance, may_merge
 
 from bench.figures import Figure, Paired, Setup, in_turn
 from deworldsg_ros.config import MergingConfig
@@ -193,8 +190,7 @@ def search_with_linalg(graph: GlobalGraph, local: LocalGraph) -> list[int]:
         local.means_world, local.covariances_world, local.class_probabilities
     ):
         distances = hellinger_distance(mean, covariance, nodes.means, nodes.covariances)
-        classes = class_distance(probabilities, nodes.class_probabilities)
-        passing = may_merge(distances, classes, 0.7, 0.8)
+        passing = (distances < 0.7) & (1 - nodes.class_probabilities @ probabilities < 0.8)
         best = np.where(passing, distances, np.inf).argmin()
         found.append(int(best) if passing[best] else -1)
     return found

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from support.killing import full_disk, killed, moments_s, names
+from support.killing import full_disk, killed, names
 
 from deworldsg_ros.base import files
 
@@ -97,16 +97,6 @@ def test_a_full_disk_keeps_the_old_file(tmp_path, size):
     assert path.read_bytes() == b"old" and names(tmp_path) == ["a.json"]
 
 
-@pytest.mark.parametrize("size", [0, 10, 5000])
-def test_a_full_disk_keeps_the_old_run(tmp_path, size):
-    (tmp_path / "theirs").write_text("theirs")
-    write_run(tmp_path, 1)
-    before = {name: (tmp_path / name).read_bytes() for name in names(tmp_path)}
-    with full_disk(size), pytest.raises(OSError):
-        write_run(tmp_path, 2)
-    assert {name: (tmp_path / name).read_bytes() for name in names(tmp_path)} == before
-
-
 FILES = ("config.yaml", "graph.json", "graph.png", "run.json")
 
 
@@ -133,28 +123,10 @@ def test_files_of_two_runs_are_never_side_by_side(tmp_path):
         assert run_in(tmp_path) == {b"%05d" % run}
 
 
-def test_an_error_in_a_run_keeps_the_run_before(tmp_path):
-    write_run(tmp_path, 1)
-    with pytest.raises(KeyboardInterrupt), files.together(tmp_path, FILES) as staged:
-        (staged / "run.json").write_text("new")
-        raise KeyboardInterrupt
-    assert run_in(tmp_path) == {b"00001"} and names(tmp_path) == [*FILES[1:]]
-
-
 def test_a_name_that_is_a_folder_is_refused_at_the_start(tmp_path):
     (tmp_path / "run.json").mkdir()
     with pytest.raises(IsADirectoryError), files.together(tmp_path, FILES):
         pytest.fail("the run has begun")
-
-
-def test_a_kill_at_any_moment_leaves_whole_files_of_one_run(tmp_path):
-    write_run(tmp_path, 1)
-    for kill, moment_s in enumerate(moments_s(50, 0.02)):
-        runs = iter(range(100 * kill, 100_000))
-        killed(lambda runs=runs: write_run(tmp_path, next(runs)), 0.005 + moment_s)
-        assert len(run_in(tmp_path)) <= 1
-        files.remove_left_overs(tmp_path)
-        assert len(run_in(tmp_path)) == 1 and set(names(tmp_path)) <= set(FILES)
 
 
 def test_a_kill_between_two_renames_is_completed_by_the_next_run(tmp_path):

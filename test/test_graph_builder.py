@@ -1,30 +1,20 @@
 """The published graph: what it says depends on no history, and updates are what differs."""
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.merging import VOCABULARY as VOCABULARY_OF_FRAMES
-from support.merging import local_graph, set_confirmed
+from support.merging import local_graph
 from support.reference_updates import diff
-from support.room_nodes import VOCABULARY, add_node, bowl, chair, room, surface, table, thing
+from support.room_nodes import DINNER, VOCABULARY, change, room
 
-from deworldsg_ros.config import Config, RelationsConfig
-from deworldsg_ros.graph.pairs import frame_votes
+from deworldsg_ros.config import Config, OutputConfig, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.wire.follow import GraphReplica
 
-WIDTH = len(VOCABULARY.predicates)
-LABELS = ("dining table", "chair", "cup", "bowl")
-THINGS = {
-    "table": table(0, 0),
-    "chair": chair(0, 0.5),
-    "cup": thing("cup", 0.3, 0.1, 0.74, 0.09, 0.09, 0.1),
-    "bowl": bowl(-0.2, 0, 0.74),
-    "book": thing("book", 0.1, -0.1, 0.74, 0.2, 0.28, 0.03),
-    "fridge": thing("refrigerator", 1.3, 0, 0, 0.6, 0.6, 1.7),
-}
 RULES = {
     "physics": RelationsConfig(),
     "votes": RelationsConfig(world_model="none"),
@@ -34,55 +24,13 @@ RULES = {
 of_all = pytest.mark.parametrize("relations", RULES.values(), ids=list(RULES))
 
 
-def classes_of(rng: np.random.Generator) -> np.ndarray:
-    classes = np.zeros(len(VOCABULARY.classes))
-    classes[[VOCABULARY.classes.index(label) for label in LABELS]] = rng.dirichlet(np.ones(4))
-    return classes
-
-
-def change(builder: GraphBuilder, rng: np.random.Generator) -> None:
-    """Anything that may change an edge, at random."""
-    graph = builder.graph
-    one, other = rng.choice(list(graph.nodes.slot_of), 2, replace=False).tolist()
-    kinds = ["votes"] * 4 + ["see", "near", "predict"] * 3 + ["observe", "move"] * 2
-    kind = rng.choice([*kinds, "confirm", "merge", "remove", "take over", "add"])
-    item = list(THINGS.values())[rng.integers(len(THINGS))]
-    if kind == "votes":
-        logits = rng.normal(-1, 4, (2, WIDTH))
-        graph.add_votes(one, other, frame_votes(logits) if rng.integers(3) else None)
-    elif kind == "see":
-        graph.add_visual(one, other, rng.normal(0, 3, WIDTH), 1)
-    elif kind == "near":
-        graph.add_neighbours([(one, other), (other, one)], 1)
-    elif kind == "predict":
-        pair = [VOCABULARY.classes.index(label) for label in rng.choice(LABELS, 2)]
-        builder.prior.update(np.array([pair]), rng.dirichlet(np.ones(WIDTH), 1))
-    elif kind == "observe":
-        points = surface(item.parts, rng, 20)
-        graph.observe(one, np.zeros(3), np.eye(3), classes_of(rng), 2, points)
-    elif kind == "move":
-        T = np.eye(4)
-        T[:2, 3] = rng.normal(0, 0.4, 2)
-        graph.move_node(one, T)
-    elif kind == "confirm":
-        set_confirmed(graph, one, bool(rng.integers(2)))
-    elif kind == "add" or len(graph) < 5:
-        set_confirmed(graph, add_node(builder, item, rng, frames=1), bool(rng.integers(4)))
-    elif kind == "merge":
-        graph.merge_nodes(one, other)
-    elif kind == "remove":
-        graph.remove_node(one)
-    else:
-        graph.take_over(*sorted((one, other)))
-
-
 @of_all
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_edges_do_not_depend_on_the_history(relations: RelationsConfig, seed: int) -> None:
     """Things are seen, moved and merged; a new builder of the same graph says the same."""
     rng, config = np.random.default_rng(seed), Config(relations=relations)
-    builder, replica = room(THINGS, config, seed)[0], GraphReplica()
+    builder, replica = room(DINNER, config, seed)[0], GraphReplica()
     for _ in range(30):
         change(builder, rng)
         update = builder.update()
@@ -110,7 +58,8 @@ def test_edges_do_not_depend_on_the_history(relations: RelationsConfig, seed: in
 def test_an_update_is_what_two_snapshots_differ_in(
     relations: RelationsConfig, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    builder, _ = room(THINGS, Config(relations=relations))
+    output = OutputConfig(include_surface_points=seed == 1)
+    builder, _ = room(DINNER, Config(relations=relations, output=output))
     rng = np.random.default_rng(seed)
     removals: list[dict[int, int | None]] = []
     take = builder.graph.take_removals
@@ -126,6 +75,8 @@ def test_an_update_is_what_two_snapshots_differ_in(
             assert current is previous and not removals[-1]
             continue
         assert update == diff(previous, current, removals[-1])
+        for node in (*update.nodes, *current.nodes):
+            assert (node.surface_mm is not msgspec.UNSET) == (seed == 1)
         previous, told = current, told + 1
     assert told > 5 and max(removals, key=len)
 

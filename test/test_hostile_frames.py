@@ -65,12 +65,6 @@ def sent(local: LocalGraph) -> LocalGraph:
     return local_graph_from_message(wire.decode(text, wire.LocalGraphMessage))
 
 
-def some(count: int, seed: int = 0) -> LocalGraph:
-    """A local graph of at least this many objects."""
-    rng = np.random.default_rng(seed)
-    return next(g for g in (hostile_local_graph(rng, 1) for _ in range(50)) if len(g) >= count)
-
-
 def hostile_edit(rng: np.random.Generator, builder: GraphBuilder) -> EditRequest:
     ids = list(builder.graph.nodes.slot_of) or [1]
     a, b = (int(rng.choice(ids)) for _ in range(2))
@@ -143,14 +137,16 @@ def test_a_refused_local_graph_leaves_the_graph_as_it_was(config: Config) -> Non
 
 @of_all
 def test_the_largest_sums_of_logits_are_published_and_saved(config: Config, tmp_path) -> None:
-    builder, replica, local = GraphBuilder(config, VOCABULARY, "map"), GraphReplica(), some(2, 3)
+    builder, replica = GraphBuilder(config, VOCABULARY, "map"), GraphReplica()
+    rng = np.random.default_rng(3)
+    local = next(one for one in (hostile_local_graph(rng, 1) for _ in range(50)) if len(one) >= 2)
     pairs = np.tile([[0, 1]], (limits.MAX_RELATIONS, 1))
     logits = np.tile(np.array([1.0, -1.0, 1.0]) * limits.MAX_LOGIT, (len(pairs), 1))
     relations = Relations(pairs, logits, np.ones(len(pairs)))
     for stamp_ns in range(1, 5):
         builder.integrate(replace(local, stamp_ns=stamp_ns * 10**8, relations=relations))
         check_published(builder, replica)
-    (pair,) = builder.graph.edges
+    pair = next(iter(builder.graph.edges))
     for _ in range(2000):  # as such frames would
         builder.graph.add_visual(*pair, logits.sum(axis=0), 1)
     check_map(builder, config, tmp_path / "a.map")

@@ -9,10 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 from support.failing_backend import Backend
-from support.relations import mean_of
-from support.scripted import CONFIGURATIONS, INTRINSICS, PAPER, VOCABULARY, Scripted, frame
+from support.scripted import INTRINSICS, PAPER, VOCABULARY, Scripted, frame
 
-from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsConfig, load_config
+from deworldsg_ros.config import Config, MergingConfig, RelationsConfig
 from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
@@ -30,7 +29,6 @@ from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.wire import messages as wire
-from deworldsg_ros.wire.follow import GraphReplica
 
 ASKING = msgspec.structs.replace(
     PAPER,
@@ -72,24 +70,6 @@ def test_a_camera_that_stands_still_for_200_frames_sees_one_node_an_object(
     assert edge.probability > 0.999
 
 
-def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
-    pipeline = Pipeline(ASKING, Scripted(logits=(0.001, 0.0, 0.0)))
-    for index in range(3):
-        pipeline.process(frame(index))
-    builder = pipeline.builder
-    assert builder is not None
-    edge, back = pipeline.graph().edges  # cup and table alone are neighbours (Eq. 8)
-    assert edge.provenance == "fused" and back.provenance == "prior"
-    assert (back.subject, back.object) == (edge.object, edge.subject)
-    assert edge.entropy_nats == pytest.approx(np.log(3), abs=1e-4)
-    prior = mean_of(builder.prior, 0, 1)
-    visual = np.exp([0.003, 0.0, 0.0]) / np.exp([0.003, 0.0, 0.0]).sum()
-    expected = (visual + 0.5 * prior) / 1.5
-    told = {belief.label: belief.probability for belief in edge.predicates}
-    for predicate, value in zip(VOCABULARY.predicates, expected):
-        assert told[predicate] == pytest.approx(value, abs=1e-4)
-
-
 def test_evidence_that_comes_late_gives_the_same_graph() -> None:
     # Without a graph the reasoner encodes every clip; so must the pipeline.
     every_clip = msgspec.structs.replace(ASKING.relations, max_clips_per_s=0.0)
@@ -114,26 +94,6 @@ def test_evidence_that_comes_late_gives_the_same_graph() -> None:
         assert one.probability == pytest.approx(other.probability, abs=1e-12)
 
 
-@pytest.mark.parametrize("points", [False, True])
-def test_a_client_that_missed_nothing_has_the_graph_exactly(points: bool) -> None:
-    config = msgspec.structs.replace(PAPER, output=OutputConfig(include_surface_points=points))
-    builder, replica = GraphBuilder(config, VOCABULARY, "map"), GraphReplica()
-    replica.reset(builder.snapshot())
-    for index in range(6):
-        builder.integrate(local_graph(index))
-        update = builder.update()
-        assert update is not None and update.sequence == index + 1
-        assert [entry.nodes for entry in update.associations] == [[1, 2, 3]]
-        replica.apply(wire.decode(wire.encode(update), wire.SceneGraphUpdateMessage))
-        assert replica.message() == builder.snapshot()
-    assert builder.update() is None
-    # A snapshot is that of the last update, whatever came since.
-    builder.integrate(local_graph(6))
-    builder.graph.remove_node(1)
-    builder.full()
-    assert replica.message() == builder.snapshot()
-
-
 def test_a_late_update_contains_the_remembered_frames_only() -> None:
     builder = GraphBuilder(PAPER, VOCABULARY, "map")
     seen = local_graph(0)
@@ -153,24 +113,6 @@ def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
         assert refused.value.reason == reason
     with pytest.raises(RefusedInput, match="no frame was processed"):
         Pipeline(PAPER, Scripted()).graph()
-
-
-def test_the_paper_differs_from_the_default_in_these_options() -> None:
-    assert load_config(CONFIGURATIONS / "default.yaml") == Config()
-    default, paper = (msgspec.to_builtins(config) for config in (Config(), PAPER))
-    assert {
-        (section, field)
-        for section in default
-        for field, value in default[section].items()
-        if paper[section][field] != value
-    } == {
-        ("perception", "max_relations"),
-        ("perception", "refine_detections"),
-        ("merging", "association"),
-        ("relations", "max_clips_per_s"),
-        ("relations", "edge_belief"),
-        ("relations", "world_model"),
-    }
 
 
 # --- work ahead of its use -----------------------------------------------------------------------

@@ -4,13 +4,9 @@ import json
 
 import pytest
 
-from deworldsg_ros.base.words import counted, suggestion, visible, visible_lines, whole_number
+from deworldsg_ros.base.words import suggestion, visible, whole_number
 
 KNOWN = ["perception.score_threshold", "perception.threads", "lifting.tau", "save_path"]
-
-
-def test_one_is_singular() -> None:
-    assert [counted(n, "frame") for n in (0, 1, 2)] == ["0 frames", "1 frame", "2 frames"]
 
 
 @pytest.mark.parametrize(
@@ -39,12 +35,6 @@ def test_what_is_no_character_to_see_is_an_escape(text: str) -> None:
     shown = visible(text)
     assert shown.isprintable() and "\\u" in shown
     assert json.loads(f'"{shown}"') == text
-
-
-def test_other_text_is_shown_as_it_is() -> None:
-    for text in ("", "dining table", "Stühle 椅子 🪑", "[bold]", "100 %"):
-        assert visible(text) == text
-    assert visible_lines("a\tb\nc") == "a\\u0009b\nc"
 
 
 def test_only_ascii_digits_write_a_number() -> None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from deworldsg_ros.base.kernels import kernel
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.scene.checks import check_array
 from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M
@@ -147,14 +147,6 @@ def _check_points(points_world: Float32 | Float64) -> None:
 def _columns(points: Float32 | Float64) -> Float64:
     """Points (n, 3) as the kernels take them: (3, n) float64."""
     return np.ascontiguousarray(points.T, np.float64)
-
-
-def _box(columns: Float64, axes: Float64, quat_axes: Float64, box: Float64) -> None:
-    """Write `box_of` columns (3, n): centre, size and quaternion, (10,)."""
-    upright, squared = _third_neighbours(columns, axes)
-    ordered, middle = np.sort(squared), (len(squared) - 1) // 2
-    median = (ordered[middle] + ordered[len(squared) // 2]) / 2.0
-    _box_around(upright, squared <= OUTLIER_FACTOR**2 * median, axes, quat_axes, box)
 
 
 def horizontal_axes(up: Sequence[float]) -> Float64:
@@ -315,17 +307,48 @@ def _third_neighbours(columns: Float64, axes: Float64) -> tuple[Float64, Float64
 
 
 @kernel
-def _box_around(
-    upright: Float64, kept: Bool, axes: Float64, quat_axes: Float64, box: Float64
-) -> None:
-    """Write the box around those of columns (3, n), turned to axes, that are kept (n,)."""
+def _median(values: Float64) -> float:
+    """The median of values (n,), which change their order (Hoare's selection)."""
+    last, middle = len(values) - 1, len(values) // 2
+    low, high = 0, last
+    while low < high:
+        pivot, left, right = values[(low + high) // 2], low, high
+        while left <= right:
+            while values[left] < pivot:
+                left += 1
+            while values[right] > pivot:
+                right -= 1
+            if left <= right:
+                values[left], values[right] = values[right], values[left]
+                left += 1
+                right -= 1
+        if middle <= right:
+            high = right
+        elif middle >= left:
+            low = left
+        else:
+            break
+    above = float(values[middle])
+    if last % 2 == 0:
+        return above
+    below = float(values[0])
+    for index in range(middle):
+        below = max(below, float(values[index]))
+    return (below + above) / 2.0
+
+
+@kernel
+def _box(columns: Float64, axes: Float64, quat_axes: Float64, box: Float64) -> None:
+    """Write `box_of` columns (3, n): centre, size and quaternion, (10,)."""
+    upright, squared = _third_neighbours(columns, axes)
+    most = OUTLIER_FACTOR**2 * _median(squared.copy())
     # Vertical bounds, and horizontal ones along the axes of each heading.
     low, high, bounds = np.inf, -np.inf, np.empty((4, ALIGNED_HEADINGS), np.float64)
     lefts, rights, backs, fronts = bounds[0], bounds[1], bounds[2], bounds[3]
     for step in range(len(_HEADINGS)):
         lefts[step], rights[step], backs[step], fronts[step] = np.inf, -np.inf, np.inf, -np.inf
     for place in range(upright.shape[1]):
-        if not kept[place]:
+        if not squared[place] <= most:
             continue
         x, y, z = upright[0, place], upright[1, place], upright[2, place]
         low, high = min(low, z), max(high, z)

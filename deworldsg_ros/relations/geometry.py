@@ -426,8 +426,10 @@ def _bounds(out: Float64, one: Any, other: Any, floor_m: float) -> None:
     out[1], out[2] = min(overlap_x, overlap_y), max(overlap_x, overlap_y)
     out[3] = min(one.high[2], other.high[2]) - max(one.low[2], other.low[2])
     shared = max(0.0, overlap_x) * max(0.0, overlap_y)
-    out[4] = min(1.0, shared / _area(one))
-    out[5] = min(1.0, shared / _area(other))
+    for place in range(2):
+        shape = one if place == 0 else other
+        x, y = shape.high[0] - shape.low[0], shape.high[1] - shape.low[1]
+        out[4 + place] = min(1.0, shared / (max(0.01, x) * max(0.01, y)))
     out[21] = one.low[2] - other.low[2]
     out[22] = one.high[2] - other.high[2]
     out[23] = one.low[2] - other.high[2]
@@ -500,7 +502,8 @@ def _contact(out: Float64, one: Any, other: Any, points: Float32) -> None:
             lower += 1
     out[6] = min(1.0, bottom - top) if top > -1e8 else 1.0
     # Cells of the footprint that the layer covers. A surface with few points cannot cover all.
-    cell_limit = min(64.0, max(8.0, len(points) * width_x * width_y / _area(other)))
+    area = max(0.01, other.high[0] - other.low[0]) * max(0.01, other.high[1] - other.low[1])
+    cell_limit = min(64.0, max(8.0, len(points) * width_x * width_y / area))
     out[7] = min(1.0, cells.sum() / cell_limit)
     out[8] = np.log(1.0 + layer)
     out[9] = higher / max(1, around)
@@ -510,12 +513,6 @@ def _contact(out: Float64, one: Any, other: Any, points: Float32) -> None:
     out[14] = level / max(1, len(points))
     if layer > 1:
         out[11] = np.sqrt(max(0.0, squares / layer - (total / layer) ** 2))
-
-
-@kernel
-def _area(shape: Any) -> float:
-    x, y = shape.high[0] - shape.low[0], shape.high[1] - shape.low[1]
-    return float(max(0.01, x) * max(0.01, y))
 
 
 @kernel

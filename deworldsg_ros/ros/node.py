@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import traceback
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -234,6 +235,8 @@ STUCK_S = 60.0
 SWITCH_S = 0.001
 # Begins the names of parameters that override the QoS of a topic.
 OVERRIDES = "qos_overrides."
+# Nodes that exist, also those whose constructor has not ended.
+_begun: weakref.WeakSet[Node] = weakref.WeakSet()
 
 
 class StageNode(Node):
@@ -265,6 +268,7 @@ class StageNode(Node):
 
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, **options)
+        _begun.add(self)
         self.parameters: Any = declare(self, self.PARAMETERS, self.LIVE, (OVERRIDES,))
         self.get_logger().info("loading")
         on_compilation(lambda: self.get_logger().info(COMPILING))
@@ -536,7 +540,14 @@ def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> in
     """
 
     def body(stop: threading.Event) -> int:
-        node = make_node()
+        others = set(_begun)
+        try:
+            node = make_node()
+        except BaseException:
+            # Fast DDS sometimes waits without end for a node that is there when the process ends.
+            for unfinished in set(_begun) - others:
+                unfinished.destroy_node()
+            raise
         is_respawned, hung = os.environ.get(RESPAWN_VARIABLE) == "true", ""
         sys.setswitchinterval(SWITCH_S)
         # A full collection stops all threads. It would look at all objects of the imported modules

@@ -3,14 +3,12 @@
 A CPU stands in for a GPU: it computes in float16 and bfloat16, too. CUDA itself is not tested.
 """
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from support.checkpoints import clip, config_of, request, save_random_probe, save_vjepa2
 from support.torch_models import image, save_rtdetr, save_sam2, save_sam3, settings, torch
 
-from deworldsg_ros.checkpoints.loading import choose_dtype, in_best_precision
+from deworldsg_ros.checkpoints.loading import in_best_precision
 from deworldsg_ros.perception.backends import sam
 from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
 from deworldsg_ros.perception.backends.sam import Sam2Segmenter, Sam3Segmenter
@@ -61,15 +59,6 @@ def test_half_precision_is_kept_where_it_is_exact_enough(scale, wanted, run, use
     model, dtype = in_best_precision(model, CPU, wanted, run, "the network")
     assert dtype == used and model.weight.dtype == used
     assert words in caplog.text and bool(words) == bool(caplog.messages)
-
-
-@pytest.mark.parametrize(("native", "wide"), [(True, BRAIN), (False, HALF)])
-def test_sam_prefers_bfloat16_where_the_device_has_it(monkeypatch, native, wide):
-    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: native)
-    gpu = SimpleNamespace(type="cuda")  # only the type is read
-    assert choose_dtype(gpu) == HALF
-    assert choose_dtype(gpu, wide_range=True) == wide
-    assert choose_dtype(CPU, wide_range=True) == SINGLE
 
 
 @pytest.mark.parametrize(

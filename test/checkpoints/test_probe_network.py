@@ -133,14 +133,6 @@ def test_a_probe_accepts_only_the_backbone_of_its_training(changes, fits):
         assert str(other) in refused("vjepa2 with 48 features", card.require_backbone, other)
 
 
-def test_a_probe_accepts_only_the_predicates_of_its_training():
-    card = ProbeCard(BACKBONE, PREDICATES)
-    card.require_predicates(PREDICATES)
-    mixed = "lacks 'on', 'near' and has 'predicate 0', "
-    refused(mixed, card.require_predicates, ("on", "near"))
-    refused("another order", card.require_predicates, PREDICATES[::-1])
-
-
 def test_folders_that_are_incomplete_damaged_or_old_are_refused(tmp_path):
     card_file, model = tmp_path / "config.json", tmp_path / "model.safetensors"
     refused("no config.json", load_probe, tmp_path)
@@ -197,6 +189,7 @@ def test_a_world_model_refuses_another_backbone_and_other_predicates(backbone, t
     require_predicates(model, VOCABULARY.predicates)
     require_predicates(None, ("on",))
     refused("4 predicates and the graph has 1", require_predicates, model, ("on",))
+    refused("another order", require_predicates, model, VOCABULARY.predicates[::-1])
     # And during a run.
     asked = replace(request(), vocabulary=replace(VOCABULARY, predicates=("on", "near")))
     refused("4 predicates and the graph has 2", model.predict, asked)

@@ -12,8 +12,6 @@ from deworldsg_ros.cli.configuration import described_yaml, effective_config
 from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.recordings.recording import open_recording
 
-GIVEN = ("--intrinsics", "60,61,31.5,23.5")
-
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):

@@ -112,9 +112,6 @@ def test_sums_of_a_merge_are_those_that_a_message_may_have():
     assert combine.combine(last, last, same).ids == {most: most}
 
 
-# --- only near pairs are compared, with the result of all pairs -------------------------------
-
-
 def objects(count: int, seed: int) -> list[SceneObject]:
     rng = np.random.default_rng(seed)
     labels, places = rng.choice(["cup", "chair", "lamp"], count), rng.uniform(0, 3, (count, 3))

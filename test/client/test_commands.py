@@ -88,9 +88,6 @@ def test_the_terminal_shows_names_as_text(command, monkeypatch):
     assert "\nelement" not in text
 
 
-# --- edit --------------------------------------------------------------------------------------
-
-
 def saved_map(folder: Path, config: Config) -> Path:
     builder = GraphBuilder(config, VOCABULARY, "world")
     for stamp in range(1, 8):

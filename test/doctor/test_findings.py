@@ -1,7 +1,5 @@
 """Observations become sentences; without observations there are none."""
 
-from __future__ import annotations
-
 import pytest
 
 from deworldsg_ros.doctor import FrameChecks, Observations, find
@@ -48,10 +46,8 @@ ALL_IS_WELL = {
     [
         ({}, None, ""),
         (ALL_IS_WELL, None, ""),
-        ({"found_nodes": False}, "no_nodes", "ROS_DOMAIN_ID"),
         ({"silent": {"/rgb": ("/camera/color",)}}, "no_publisher", "/camera/color"),
         ({"silent": {"/rgb": ()}}, "no_publisher", "Start the driver"),
-        ({"incompatible": ("/x is best effort",)}, "qos", "inputs.reliability"),
         ({"behind_s": {"/odom": 0.3, "/pose": 3600.0}}, "clock", "/pose are 3600 s beh"),
         ({"behind_s": {"/pose": -90.0}}, "clock", "90 s ahead of the clock"),
         ({"missing": ("no depth on /d for 5 s",)}, "no_input", "No depth on /d for 5 s"),
@@ -59,28 +55,20 @@ ALL_IS_WELL = {
         (drops(lost_rgb=30), "lost_images", "30 of rgb"),
         (drops(lost_rgb=1), None, ""),
         (drops(pose_jump=14), "pose_jumps", "at 14 images"),
-        (drops(no_pose=90), "late_poses", "90 images"),
         (drops(grid_mismatch=9), "not_registered", "another size"),
         (
             drops(0, detector_error=1) | {"examples": {"detector_error": "no memory."}},
             "detector_error",
             "no memory.",
         ),
-        (checks(0.02), "little_depth", "Only 2%"),
         (sizes(4.0), "depth_unit", "times as large as usual: a"),
         (sizes(0.2), "depth_unit", "0.2 times as large"),
         (sizes(4.0, count=2), None, ""),
-        (fits("factor 5", 0.9, still=0.5), "depth_unit", "multiplied by 5"),
-        (checks(depth_shift_px=(24.0, 0.0), shift_gain=0.5), "not_registered", "24 pixels away"),
         (checks(depth_shift_px=(4.0, 0.0), shift_gain=0.5), None, ""),
         (checks(depth_shift_px=(40.0, 40.0), shift_gain=0.0), None, ""),
         (fits("still", 0.8), "poses_do_not_fit", "--odometry"),
-        (fits("body", 0.8), "poses_of_the_body", "optical frame"),
-        (fits("inverse", 0.8), "poses_inverted", "inverse"),
-        (fits("late 0.4", 0.8), "late_poses", "0.4 s later"),
         (fits("late -0.2", 0.8), "late_poses", "0.2 s earlier"),
         (fits("still", 0.5), "poses_do_not_fit", "tremble"),
-        ({"turns": {0: 3, 1: 97}}, "turned", "90 degrees in 97 frames"),
         ({"turns": {2: 1}}, "turned", "180 degrees in 1 frame."),
         (few(100, 2, 12, classes=COCO_CLASSES), "few_detections", "80 classes: person, bicycle"),
         (few(1, 0, 3, hidden={"seen too little": 3}), "few_frames", "Only 1 frame reached"),

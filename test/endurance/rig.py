@@ -1,7 +1,5 @@
 """Four node processes, and a camera that repeats a recording for ever with stamps that grow."""
 
-from __future__ import annotations
-
 import os
 import signal
 import struct
@@ -27,14 +25,7 @@ STAMP, STAMP_AT = struct.Struct("<iI"), 4
 
 
 class Rig:
-    """The nodes and their camera; `folder` is for everything that the nodes write.
-
-    Attributes:
-        processes: by name.
-        graph: the newest whole graph; None before the first.
-        updates: number of updates so far.
-        values: newest diagnostics of each node, by its name.
-    """
+    """The nodes and their camera; `folder` is for everything that the nodes write."""
 
     def __init__(self, folder: Path) -> None:
         # A domain of its own, and shared memory for images, also outside of pytest.
@@ -42,9 +33,9 @@ class Rig:
         self._folder, self.map_path = folder, folder / "room.map"
         self.processes: dict[str, NodeProcess] = {}
         self.peer = Peer("endurance")
-        self.graph: wire.SceneGraphMessage | None = None
+        self.graph: wire.SceneGraphMessage | None = None  # the newest whole one
         self.updates = 0
-        self.values: dict[str, dict[str, str]] = {}
+        self.values: dict[str, dict[str, str]] = {}  # newest diagnostics of each node
         self._graph_texts = self.peer.collect("/scene_graph", 1, latched=True)
         self._update_texts = self.peer.collect("/scene_graph/updates")
         self._results = self.peer.collect("deworldsg/local_graph")
@@ -59,14 +50,12 @@ class Rig:
         self._started_s = self._last_s = self._result_s = 0.0
 
     def start(self, name: str) -> None:
-        """Start a node; does not wait for it."""
         folder = self._folder / str(time.monotonic_ns())
         folder.mkdir(parents=True)
         parameters = {"map_path": f"'{self.map_path}'", "map_period_s": MAP_PERIOD_S}
         self.processes[name] = NodeProcess(name, folder, parameters=parameters)
 
     def start_all(self) -> None:
-        """Start all nodes and wait until they are ready."""
         for name in NODES:
             self.start(name)
         for process in self.processes.values():
@@ -92,7 +81,6 @@ class Rig:
         return True
 
     def close(self) -> None:
-        """End the nodes."""
         for process in self.processes.values():
             process.end()
         self.peer.close()
@@ -114,7 +102,6 @@ class Rig:
             self._next += 1
 
     def _read(self) -> None:
-        """Take what has arrived."""
         self.updates += len(self._update_texts)
         if self._results:  # a result also ends the frames before it
             self._in_flight, self._result_s = 0, time.monotonic()
@@ -128,7 +115,6 @@ class Rig:
 
 
 def shifted(message: RawRoleMessage, by_ns: int) -> bytes:
-    """The serialized message with a later stamp."""
     data = bytearray(message.data)
     STAMP.pack_into(data, STAMP_AT, *divmod(message.stamp_ns + by_ns, 10**9))
     return bytes(data)

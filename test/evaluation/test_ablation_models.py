@@ -1,9 +1,4 @@
-"""Ablation (d) and (e): a table with world models of clips and their probes.
-
-The backbones are tiny and have random weights: the test shows that the parts fit together.
-"""
-
-from __future__ import annotations
+"""Ablation (d) and (e) with tiny world models of clips, and probes with random weights."""
 
 import json
 

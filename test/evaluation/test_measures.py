@@ -9,14 +9,9 @@ from support.evaluation import write_dataset
 from support.sequences import write_ground_truth
 
 from deworldsg_ros.evaluation.edge_measures import (
-    Calibrated,
     EdgeView,
     ReferenceScene,
-    ReliabilityBin,
-    calibration_error,
     read_reference,
-    reliability,
-    total_log_loss,
     write_edge_list,
 )
 from deworldsg_ros.evaluation.graph_measures import (
@@ -40,7 +35,6 @@ def scene(labels, relations):
 
 
 def node(number, label, x, weight=1.0, observations=1):
-    """A cube of 1 m at x."""
     corners = [(dx, dy, dz) for dx in (-0.5, 0.5) for dy in (-0.5, 0.5) for dz in (-0.5, 0.5)]
     mean = np.array([x, 0.5, 0.5])
     return NodeView(number, label, 0.8, mean, mean + corners, weight, observations)
@@ -211,16 +205,3 @@ def test_the_edge_list_has_the_worst_edges_first(tmp_path):
     assert (rows[1]["truth"], rows[1]["reverse_truth"]) == ("under", "on")
     # A missed relation names the main nodes; the graph has none of the chair.
     assert (rows[3]["subject"], rows[3]["object"], rows[4]["object"]) == ("2", "1", "")
-
-
-def test_calibration():
-    beliefs = [Calibrated(0.0, False), Calibrated(1.0, True), Calibrated(0.94, False)]
-    assert reliability(beliefs) == [ReliabilityBin(1, 0, 0), ReliabilityBin(2, 0.97, 0.5)]
-    assert math.isnan(calibration_error([]))
-    assert calibration_error(beliefs[:2]) == 0
-    # Within a bin, over and under add up to the bin's gap.
-    half = [Calibrated(0.75, True)] * 3 + [Calibrated(0.75, False)]
-    assert calibration_error(half) == pytest.approx(0)
-    beliefs = [Calibrated(0.8, True), Calibrated(0.8, False)]
-    assert total_log_loss(beliefs) == pytest.approx(-math.log(0.8) - math.log(0.2))
-    assert total_log_loss([Calibrated(1.0, False)]) == pytest.approx(-math.log(1e-3))

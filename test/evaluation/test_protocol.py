@@ -136,10 +136,9 @@ def test_matching_equals_a_search_over_all_pairs(seed):
         assert matching.prediction_of.get(number) == best
 
 
-def graph(objects, edges, predicates=None):
+def graph(objects, edges):
     """Nodes (object id, class) and edges (subject, object, predicate) between indices."""
-    if predicates is None:
-        predicates = np.array([one_hot(edge[2]) for edge in edges]).reshape(-1, 3)
+    predicates = np.array([one_hot(edge[2]) for edge in edges]).reshape(-1, 3)
     points = tuple(segment(number) for number, _ in objects)
     classes = np.array([one_hot(index) for _, index in objects]).reshape(-1, 3)
     pairs = np.array([edge[:2] for edge in edges], np.int64).reshape(-1, 2)
@@ -182,13 +181,6 @@ def test_items(tmp_path, layout, nodes, edges, hits):
     assert (result.objects, result.predicates, result.relationships) == tuple(
         (hit, 2) for hit in hits
     )
-
-
-def test_a_zero_predicate_vector_is_right_for_the_last_predicate_and_no_relationship(tmp_path):
-    annotations = data_set(tmp_path, a=(OBJECTS, [(1, 2, "under")]))
-    prediction = graph(NODES, [(0, 1, 0)], np.zeros((1, 3)))
-    result = evaluate_predictions(annotations, {"a": prediction})
-    assert (result.predicates, result.relationships) == ((1, 1), (0, 1))
 
 
 def test_every_relation_line_is_an_item_and_a_self_relation_needs_a_loop(tmp_path):

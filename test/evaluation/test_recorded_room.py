@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from support.cli import invoke
 
-from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.evaluation.recorded_room import SPELLINGS, open_annotations
 from deworldsg_ros.graph.graph_files import read_graph
@@ -25,7 +24,7 @@ MEDIAN_ERROR_M = 0.04
 def evaluate(front_end, out, *arguments):
     words = ["evaluate", "run", "--layout", "recording", RECORDING, "--checkpoints", 0]
     words += ["--front-end", front_end, *arguments, "--out", out, "--json", out / "n.json"]
-    return CliRunner().invoke(app, [str(word) for word in words])
+    return invoke(*words)
 
 
 def values_of(out, result):

@@ -7,12 +7,11 @@ import sys
 
 import msgspec
 import pytest
+from support.cli import invoke, printed, refusal
 from support.evaluation import write_dataset, write_json, write_predictions
 from support.sequences import BLOCKS, RELATIONS, write_room, write_sequence, write_surface
-from typer.testing import CliRunner
 
 from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard, write_probe_card
-from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import Config, RelationsConfig, load_config
 from deworldsg_ros.evaluation.front_ends import FrontEndChoice
 from deworldsg_ros.evaluation.predictions import read_predictions
@@ -62,8 +61,8 @@ def test_every_way_to_a_result_gives_the_same_numbers(root, tmp_path):
     found = evaluate_graph(annotations, "room_0", graph, ProtocolOptions())
     assert found == (outcome.result, outcome.measures)
     prediction = to_prediction(translate(graph, annotations), annotations.vocabulary)
-    write_predictions(tmp_path / "p.json", {"room_0": prediction}, 3, 3)
-    (again,) = evaluate_predictions(annotations, read_predictions(tmp_path / "p.json")).scans
+    write_predictions(tmp_path / "p.pkl", {"room_0": prediction})
+    (again,) = evaluate_predictions(annotations, read_predictions(tmp_path / "p.pkl")).scans
     assert again.matching == outcome.result.matching
     assert again.relationship_ranks == outcome.result.relationship_ranks
     assert load_config(tmp_path / "out" / "room_0" / "config.yaml") == CONFIG
@@ -106,16 +105,10 @@ def test_rotated_images_of_3rscan_are_evaluated(tmp_path):
     assert (result.object_ranks, result.relationship_ranks) == ([0, 0, 0], [0, 0])
 
 
-def invoke(command, *arguments):
-    result = CliRunner().invoke(app, ["evaluate", command, *map(str, arguments)])
-    return result.exit_code, result.output
-
-
 def values_of(tmp_path, command, *arguments):
-    """The numbers that a command wrote, and its words."""
     json_file = tmp_path / "new" / "numbers.json"
-    code, text = invoke(command, "--layout", "replica", *arguments, "--json", json_file)
-    assert code == 0, text
+    words = ("evaluate", command, "--layout", "replica", *arguments, "--json", json_file)
+    text = printed(*words)
     return json.loads(json_file.read_text()), text
 
 
@@ -153,8 +146,8 @@ def test_command_on_graphs_and_predictions(root, tmp_path):
     assert values["object_recall"] == 1.0
     assert values["measures"]["nodes"] == outcome.nodes
     (out / "room_0" / "scene_graph.json").unlink()
-    code, text = invoke("score", "--layout", "replica", root, "--graphs", out)
-    assert code == 2 and "cannot be read" in text
+    words = ("evaluate", "score", "--layout", "replica", root, "--graphs", out)
+    assert "cannot be read" in refusal(*words)
     path, scans = tmp_path / "p.json", {"room_0": {"nodes": [], "edges": []}}
     write_json(path, {"num_classes": 3, "num_predicates": 3, "scans": scans})
     options = ("--predictions", path, "--skip-no-rel-objects", "--out", out)
@@ -181,8 +174,7 @@ def test_command_on_graphs_and_predictions(root, tmp_path):
 )
 def test_command_errors_state_the_expected_value(root, tmp_path, command, arguments, expected):
     out = ("--out", tmp_path / "out") if command == "run" else ()
-    code, text = invoke(command, root, "--layout", "replica", *out, *arguments)
-    assert code == 2
+    text = refusal("evaluate", command, root, "--layout", "replica", *out, *arguments)
     assert expected in " ".join(text.split())
 
 
@@ -195,7 +187,8 @@ def test_a_failed_scan_is_reported_and_does_not_stop_the_rest(root, tmp_path):
     assert list(values["failed"]) == ["absent"]
     assert [scan["scan"] for scan in values["scans"]] == ["room_0"]
     split.write_text("absent\n")
-    assert invoke("run", "--layout", "replica", root, "--front-end", "recorded", *options)[0] == 1
+    words = ("evaluate", "run", "--layout", "replica", root, "--front-end", "recorded", *options)
+    assert invoke(*words).exit_code == 1
 
 
 def test_a_scan_of_the_training_of_the_probe_is_told(tmp_path, caplog):

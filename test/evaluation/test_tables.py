@@ -2,7 +2,6 @@
 
 import json
 import os
-import pickle
 import sys
 from collections import Counter
 from dataclasses import replace
@@ -10,17 +9,17 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from support.cli import invoke
 from support.evaluation import one_hot, segment, write_dataset, write_predictions
 from support.sequences import write_room
-from typer.testing import CliRunner
 
 from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard, write_probe_card
-from deworldsg_ros.cli.app import app
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config, MergingConfig, load_config
 from deworldsg_ros.evaluation import tables
-from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice
 from deworldsg_ros.evaluation.pose_sources import KINDS, PoseSource, repose
+from deworldsg_ros.evaluation.predictions import ScanPrediction
 from deworldsg_ros.evaluation.rows import (
     ABLATION_3DSSG,
     MAIN_3DSSG,
@@ -28,7 +27,6 @@ from deworldsg_ros.evaluation.rows import (
     REPLICA_TEST_SCANS,
     RUNTIME_MS,
     SWITCHES,
-    TABLES,
     Configurations,
     table_rows,
 )
@@ -55,10 +53,9 @@ def job(root, out, scan="room_0", **changes):
     return Job("row", replace(task, **changes))
 
 
-def invoke(root, kind, out, *arguments):
-    words = ["evaluate", "table", kind, "--layout", "replica", root, "--front-end", "recorded"]
-    words += ["--out", out, *arguments]
-    return CliRunner().invoke(app, [str(word) for word in words])
+def evaluate(root, kind, out, *arguments):
+    words = ("evaluate", "table", kind, "--layout", "replica", root, "--front-end", "recorded")
+    return invoke(*words, "--out", out, *arguments)
 
 
 def table(root, kind, out, *arguments):
@@ -66,7 +63,7 @@ def table(root, kind, out, *arguments):
     json_file = out.with_suffix(".json")
     options = ("--checkpoints", 0, "--json", json_file, *arguments)
     options += () if kind == "runtime" else ("--workers", 1)
-    result = invoke(root, kind, out, *options)
+    result = evaluate(root, kind, out, *options)
     assert result.exit_code == 0, result.output
     rows = json.loads(json_file.read_text())["rows"]
     return {row["name"]: row for row in rows if not row["printed"]}, result.output
@@ -151,8 +148,8 @@ def test_the_main_table(root, tmp_path):
     run_job(job(root, tmp_path / "before"))
     graph = read_graph(tmp_path / "before" / "room_0")
     vocabulary = Vocabulary(("book", "chair", "table"), ("near", "on", "under"))
-    write_predictions(tmp_path / "p.json", {"room_0": to_prediction(graph, vocabulary)}, 3, 3)
-    other = ("--predictions", f"SGFN={tmp_path / 'p.json'}")
+    write_predictions(tmp_path / "p.pkl", {"room_0": to_prediction(graph, vocabulary)})
+    other = ("--predictions", f"SGFN={tmp_path / 'p.pkl'}")
     rows, text = table(root, "main", out, *other)
     assert list(rows) == ["fross", "kim", "paper_rules", "default", "SGFN"]
     assert rows["default"]["title"] == "default: recorded detections, embedded world model"
@@ -211,19 +208,6 @@ TRUE_POSES = [PoseSource()]
 
 def rows_of(kind, poses=TRUE_POSES, files=UNCHANGED, front_end="backend"):
     return {row.name: row for row in table_rows(kind, poses, FrontEndChoice(front_end), files)}
-
-
-def test_each_condition_applies_to_its_rows():
-    hard = rows_of("hard", front_end="recorded")
-    assert hard["paper_rules-label"].front_end.faults == Faults(label=0.1)
-    assert hard["paper_rules-jitter"].poses.noise.jitter_deg == 1.0
-
-
-@pytest.mark.parametrize("kind", TABLES)
-def test_names_and_titles_of_rows_are_unique(kind):
-    poses = [PoseSource(pose_kind) for pose_kind in KINDS]
-    rows = table_rows(kind, poses, FrontEndChoice("recorded"), UNCHANGED)
-    assert len({row.name for row in rows}) == len({row.title for row in rows}) == len(rows)
 
 
 def configurations(root_dir, tmp_path, settings=()):
@@ -288,13 +272,12 @@ def test_a_row_with_a_changed_method_has_no_printed_row(root_dir, tmp_path, sett
 )
 def test_invalid_options_of_a_table_are_refused(root, tmp_path, arguments, words):
     kind, *options = arguments
-    result = invoke(root, kind, tmp_path, *options)
+    result = evaluate(root, kind, tmp_path, *options)
     assert result.exit_code == (1 if "room_9" in options else 2)
     assert words in " ".join(result.output.split())
 
 
 def test_the_printed_numbers_are_in_the_paper(shared_dir):
-    """Every printed row stands in the paper's source, number by number."""
     text = (shared_dir / "paper" / "deworldsg.tex").read_text(encoding="utf-8")
     for wrapper in ("\\textbf{", "}", " ", "\n"):
         text = text.replace(wrapper, "")
@@ -306,18 +289,11 @@ def test_the_printed_numbers_are_in_the_paper(shared_dir):
         assert f"{value:.2f}ms" in text.replace("~", "").replace("\\", "")
 
 
-def write_released(path, scans, right):
-    """Predictions with the right classes in the first `right` scans, as the release stores them."""
-    content = {
-        scan: {
-            "pcd": [segment(1).astype(np.float32), segment(2).astype(np.float32)],
-            "cls": np.array([one_hot(1 if number < right else 0), one_hot(2)], np.float32),
-            "edge_index": np.array([[0], [1]]),
-            "edge_cls": np.array([one_hot(0)], np.float32),
-        }
-        for number, scan in enumerate(scans)
-    }
-    path.write_bytes(pickle.dumps(content))
+def released(is_right):
+    """A prediction with the right classes or one wrong class."""
+    classes = np.array([one_hot(1 if is_right else 0), one_hot(2)], np.float32)
+    points = (segment(1), segment(2))
+    return ScanPrediction(points, classes, np.array([[0, 1]]), np.array([one_hot(0)]))
 
 
 @pytest.mark.parametrize(
@@ -335,9 +311,9 @@ def test_released_predictions_stand_below_the_row_of_the_paper(
     scan = ((("chair", 1), ("table", 2)), ((1, 2, "near"),))
     data = write_dataset(tmp_path / "data", dict.fromkeys(sorted(scans), scan), layout=layout)
     file, out = tmp_path / "deworldsg_predictions.pkl", tmp_path / "out"
-    write_released(file, sorted(scans), len(scans) - 1)
+    write_predictions(file, {scan: released(scan != max(scans)) for scan in sorted(scans)})
     options = ("--layout", layout, "--predictions", f"{name}={file}", "--json", out / "t.json")
-    result = invoke(data, "predictions", out, *options)
+    result = evaluate(data, "predictions", out, *options)
     assert result.exit_code == 0, result.output
     rows = {row["name"]: row for row in json.loads((out / "t.json").read_text())["rows"]}
     if printed is None:

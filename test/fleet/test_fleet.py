@@ -1,12 +1,8 @@
 """Graphs of several robots in worlds of their own become one."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 from msgspec.structs import replace
-from support.view import make_graph, make_node
+from support.view import SAVED, make_graph, make_node
 
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.client.combine import moved_object
@@ -14,7 +10,7 @@ from deworldsg_ros.fleet.fleet import FRAME_ID, Fleet
 from deworldsg_ros.scene.camera import invert_pose, rigid_motion
 from deworldsg_ros.wire import messages as wire
 
-ROOM = SceneGraph.load(Path(__file__).parents[1] / "client" / "saved" / "scene_graph_v1.json")
+ROOM = SceneGraph.load(SAVED)
 WORLDS = {
     "ada": np.eye(4),
     "bob": rigid_motion(np.array([30.0, -20.0, 0.5]), np.array([0.0, 0.0, 2.0])),

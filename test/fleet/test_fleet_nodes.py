@@ -1,21 +1,19 @@
 """fleet_link_node and fleet_node as processes: a graph on a topic goes to the fleet and back."""
 
-from __future__ import annotations
-
 import contextlib
 import json
-from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 from std_msgs.msg import String
 from support.nodes import NodeProcess, peer, run_to_end
+from support.view import SAVED
 
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.wire import messages as wire
 
-ROOM = SceneGraph.load(Path(__file__).parents[1] / "client" / "saved" / "scene_graph_v1.json")
+ROOM = SceneGraph.load(SAVED)
 
 pytest.importorskip("zenoh", reason="needs the extra fleet: eclipse-zenoh")
 

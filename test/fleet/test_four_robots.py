@@ -1,21 +1,23 @@
 """Four robots, each in a world of its own; the network fails in between."""
 
-from __future__ import annotations
-
+import contextlib
 import dataclasses
 import json
+import select
+import socket
 import subprocess
 import sys
+import threading
 import time
 import zlib
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
+from socketserver import BaseRequestHandler, ThreadingTCPServer
 
 import msgspec
 import numpy as np
 import pytest
-from support.cut_link import CutLink
 from support.nodes import ROOT, NodeProcess, peer
 
 from deworldsg_ros.client import SceneGraphClient
@@ -99,6 +101,33 @@ class Robot:
         self.follower.ask(PERIOD_S / 2)
 
 
+class CutLink(ThreadingTCPServer):
+    """Forwards to a port of this machine; while `is_cut`, nothing is delivered or refused."""
+
+    daemon_threads = True
+
+    def __init__(self, to_port):
+        super().__init__(("127.0.0.1", 0), BaseRequestHandler)
+        self.far, self.is_cut = ("127.0.0.1", to_port), threading.Event()
+        threading.Thread(target=self.serve_forever, daemon=True).start()
+
+    def finish_request(self, near, client_address):
+        self.wait_while_cut()
+        with contextlib.suppress(OSError), socket.create_connection(self.far, timeout=5) as far:
+            other = {near: far, far: near}
+            while True:
+                self.wait_while_cut()
+                for ready in select.select([near, far], [], [], 0.1)[0]:
+                    data = ready.recv(1 << 16)
+                    if not data:
+                        return
+                    other[ready].sendall(data)
+
+    def wait_while_cut(self):
+        while self.is_cut.is_set():
+            time.sleep(0.1)
+
+
 @pytest.fixture
 def router(endpoint):
     """Starts the router in a process of its own."""
@@ -128,7 +157,7 @@ def test_four_robots_become_one_graph(tmp_path, endpoint, router):
         index = ("ada", "bert", "carl", "dora").index(name)
         world = rigid_motion(rng.uniform(-30, 30, 3), np.array([0, 0, rng.uniform(-3, 3)]))
         seen = frames[index * fifth : (index + 2) * fifth]
-        at = f"tcp/127.0.0.1:{link.port}" if name == "carl" else endpoint
+        at = f"tcp/127.0.0.1:{link.server_address[1]}" if name == "carl" else endpoint
         robots[name] = Robot(name, seen, world, at)
 
     with (
@@ -170,7 +199,8 @@ def test_four_robots_become_one_graph(tmp_path, endpoint, router):
             status = {item["name"]: item for item in json.loads(texts[-1])}
     for robot in robots.values():
         robot.session.close()
-    link.close()
+    link.shutdown()
+    link.server_close()
     # Nothing is lost: the fleet has each robot's last graph.
     assert {name: item["objects"] for name, item in status.items()} == {
         name: len(robot.graph.nodes) for name, robot in robots.items()

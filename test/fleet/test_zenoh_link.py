@@ -1,7 +1,5 @@
 """Feeds and followers over a real Zenoh router; which robots are asked, over an imitated one."""
 
-from __future__ import annotations
-
 import time
 import zlib
 from types import SimpleNamespace as Value
@@ -109,10 +107,7 @@ def test_endpoints_that_cannot_be_used_are_refused_in_one_line(endpoint, opened)
 
 
 class Network:
-    """A Zenoh session: the names of robots that are there, and the logs of those that answer.
-
-    A log may be an exception, which is raised. `asked` has the names of the robots that were asked.
-    """
+    """A Zenoh session: who is there, the logs of those that answer, and who was asked."""
 
     def __init__(self):
         self.tokens, self.logs, self.asked = [], {}, []
@@ -133,15 +128,6 @@ class Network:
         return [Value(ok=Value(payload=Value(to_bytes=lambda: packed)))]
 
 
-class Clock:
-    """The clock of the module."""
-
-    now_s = 100.0
-
-    def monotonic(self):
-        return self.now_s
-
-
 @pytest.fixture
 def network():
     return Network()
@@ -154,7 +140,7 @@ def robots(network):
 
 @pytest.fixture
 def clock(monkeypatch):
-    clock = Clock()
+    clock = Value(now_s=100.0, monotonic=lambda: clock.now_s)
     monkeypatch.setattr(zenoh_link, "time", clock)
     return clock
 

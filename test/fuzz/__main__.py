@@ -1,7 +1,5 @@
 """`python -m fuzz [MINUTES]`: run cases, print figures, keep the cases that failed."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import resource

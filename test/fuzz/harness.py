@@ -1,7 +1,5 @@
 """Runs cases of the targets in turns, and keeps those that failed."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import threading
@@ -41,7 +39,6 @@ class Report:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def run(self, worker: Worker, name: str, cases: Cases) -> None:
-        """Run cases of a target."""
         began_s = time.monotonic()
         found = list(worker.run(name, cases))
         with self._lock:
@@ -49,8 +46,7 @@ class Report:
             self.seconds[name] += time.monotonic() - began_s
             for failure in filter(None, found):
                 place = failure.text.split(": ", 2)[1]
-                if (name, place) not in self.failures:
-                    self.failures[name, place] = failure
+                if self.failures.setdefault((name, place), failure) is failure:
                     print(f"{name} ({failure.member}): {failure.text!a}"[:300], flush=True)
 
 
@@ -70,15 +66,14 @@ def run_cases(
     order = [name for name in names for _ in range(TARGETS[name].weight)]
     turns = enumerate(itertools.cycle(order))
 
-    def work() -> None:
+    def work(_: int) -> None:
         with closing(Worker()) as worker:
             while time.monotonic() < end_s and sum(report.cases.values()) < cases:
                 turn, name = next(turns)
                 report.run(worker, name, (f"{seed} {turn}", TURN))
 
     with ThreadPoolExecutor(jobs) as pool:
-        for working in [pool.submit(work) for _ in range(jobs)]:
-            working.result()
+        list(pool.map(work, range(jobs)))
     return report
 
 

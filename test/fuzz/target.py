@@ -1,7 +1,5 @@
 """A reader under test: its good files, and cases made from them."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,14 +19,9 @@ class Target:
     DeWorldSGError. Everything else is a failure: other exceptions (also AssertionError,
     for content that should not have been accepted), too much memory or time, a dead process.
 
-    Attributes:
-        name: of the folder of its corpus.
-        make: writes the good files into an empty folder, or the file.
-        read: reads the folder or the file, uses what it read as the program does, and asserts what
-            the schema promises.
-        file: the name of the file; empty = the whole folder.
-        documents: whole contents of the files as a hypothesis strategy; None = mutations only.
-        weight: number of cases in proportion to other targets.
+    `make` writes the good files into an empty folder, or the one `file`. `read` uses what it read
+    as the program does, and asserts what the schema promises. `documents` are whole contents as a
+    strategy, besides mutations; `weight` is the number of cases in proportion to other targets.
     """
 
     name: str
@@ -55,23 +48,16 @@ class Target:
         names = list(good)
         # Every third turn.
         if self.documents is None or rng.randrange(3):
-            for _ in range(count):
-                name = rng.choice(names)
+            for name in rng.choices(names, k=count):
                 use(name, mutate(name, good[name], rng))
             return
         name = rng.choice(names)
-
-        @hypothesis.seed(rng.randrange(2**32))
-        @hypothesis.settings(
+        known = hypothesis.settings(
             max_examples=count,
             database=None,
-            deadline=None,
             derandomize=False,
             phases=[hypothesis.Phase.generate],
             suppress_health_check=list(hypothesis.HealthCheck),
         )
-        @hypothesis.given(self.documents)
-        def each(content: bytes) -> None:
-            use(name, content)
-
-        each()
+        each = hypothesis.given(self.documents)(lambda content: use(name, content))
+        hypothesis.seed(rng.randrange(2**32))(known(each))()

@@ -1,10 +1,8 @@
 """All readers by name: files here, messages in `wire_targets`."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
-import pickle
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -130,24 +128,13 @@ def _write_bag_with_tf(folder: Path) -> None:
     items = camera.camera_items(3, compressed=False, with_pose=False)
     items = [item for item in items if "color" in item[0] or item[2] == stamp_ns(0)]
     for i in range(3):
-        moving = camera.transform(stamp_ns(i), camera.WORLD, camera.CAMERA, pose(i))
+        moving = camera.tf(stamp_ns(i), (camera.WORLD, camera.CAMERA, pose(i)))
         items.append(("/tf", TF_MESSAGE, stamp_ns(i), moving))
     camera.write_bag(folder / "bag", sorted(items, key=lambda item: item[2]))
 
 
-def _write_rooms(folder: Path) -> None:
-    sequences.write_room(folder, 2)
-    sequences.write_ground_truth(folder / "data" / "room_0")
-
-
-def _write_replica(folder: Path) -> None:
-    evaluation.write_dataset(folder, {"room_0": ([("chair", 1)], [])})
-    sequences.write_sequence(folder / "data" / "room_0", 2)
-
-
-def _write_annotations(layout: str, folder: Path) -> None:
-    scans = {"a": ([("chair", 1), ("table", 2)], [(1, 2, "near")]), "b": ([("book", 3)], [])}
-    evaluation.write_dataset(folder, scans, layout=layout)
+ONE_ROOM = {"room_0": ([("chair", 1)], [])}
+SCANS = {"a": ([("chair", 1), ("table", 2)], [(1, 2, "near")]), "b": ([("book", 3)], [])}
 
 
 def _read_annotations(layout: str, folder: Path) -> None:
@@ -167,16 +154,6 @@ def _read_trajectory(path: Path) -> None:
     found.at(stamp_ns(1) + 5, 1, 1, 10**8)
 
 
-def _write_pose_files(folder: Path) -> None:
-    for index in range(2):
-        np.savetxt(folder / f"frame-{index:06d}.pose.txt", pose(index), "%.9g")
-
-
-def _write_ply(form: str, path: Path) -> None:
-    points = np.random.default_rng(0).random((5, 3))
-    evaluation.write_ply(path, points, np.arange(5), form)
-
-
 def _read_ply(path: Path) -> None:
     columns = read_vertices(path, ("x", "y", "z", "objectId"))
     assert len({len(column) for column in columns.values()}) == 1
@@ -190,19 +167,12 @@ PREDICTION = ScanPrediction(
 )
 
 
-def _write_predictions(path: Path) -> None:
-    predictions = {"a": PREDICTION, "b": ScanPrediction.empty(3, 3)}
-    evaluation.write_predictions(path, predictions, 3, 3)
-
-
-def _write_pickle(protocol: int, path: Path) -> None:
-    graph = {
-        "pcd": [points.astype(np.float32) for points in PREDICTION.points_world],
-        "cls": [scores.astype(np.float32) for scores in PREDICTION.class_scores],
-        "edge_index": PREDICTION.edges.T,
-        "edge_cls": PREDICTION.edge_scores.astype(np.float32),
-    }
-    path.write_bytes(pickle.dumps({"a": graph}, protocol))
+_NODES = [{"id": i, "class_probabilities": [0.1, 0.8, 0.1], "points": [[i, 0, 0]]} for i in (0, 1)]
+_EDGES = [{"subject": 0, "object": 1, "predicate_probabilities": [0.7, 0.2, 0.1]}]
+OPEN_PREDICTIONS = {
+    **{"format": "scene graph predictions 1", "num_classes": 3, "num_predicates": 3},
+    "scans": {"a": {"nodes": _NODES, "edges": _EDGES}, "b": {"nodes": [], "edges": []}},
+}
 
 
 def _read_predictions(path: Path) -> None:
@@ -233,106 +203,94 @@ def _write_graph(folder: Path) -> None:
     graph_files.write_graph(folder, make_graph(nodes, [make_edge(1, 2)]))
 
 
-def _read_setting(path: Path) -> None:
-    effective_config(None, [path.read_bytes().decode(errors="surrogateescape")])
+def _maps() -> Iterator[Target]:
+    for rule, weight in (("surface", 3), ("paper", 2)):
+        write, read = partial(_write_map, rule), partial(_read_map, rule)
+        yield Target(f"map_{rule}", write, read, "room.map", weight=weight)
 
 
-TARGETS: dict[str, Target] = {
-    target.name: target
-    for target in (
-        *(
-            Target(
-                f"map_{rule}",
-                partial(_write_map, rule),
-                partial(_read_map, rule),
-                "room.map",
-                weight=weight,
-            )
-            for rule, weight in (("surface", 3), ("paper", 2))
+def _recordings() -> Iterator[Target]:
+    made = {
+        "bag_tf": _write_bag_with_tf,
+        "tum": lambda at: camera.write_tum(at / "freiburg1", 2),
+        "seven_scenes": lambda at: camera.write_seven_scenes(at / "seq-01", 2),
+        "scan_3rscan": lambda at: sequences.write_sequence(at / "scan", 2),
+        "scan_replica": lambda at: sequences.write_sequence(
+            evaluation.write_dataset(at, ONE_ROOM) / "data" / "room_0", 2
         ),
-        Target(
-            "config_yaml",
-            lambda path: path.write_text(to_yaml(Config())),
-            effective_config,
-            "config.yaml",
-            documents=(_CONFIGURATIONS | _PARAMETERS).map(lambda it: json.dumps(it).encode()),
-            weight=2,
+        "scan_rooms": lambda at: sequences.write_ground_truth(
+            sequences.write_room(at, 2) / "data" / "room_0"
         ),
-        Target(
-            "set_option",
-            lambda path: path.write_text("output.rate_hz=2.5"),
-            _read_setting,
-            "set.txt",
-            documents=_SETTINGS.map(lambda words: "=".join(words).encode(errors="replace")),
-        ),
-        *(
-            Target(f"bag_{name}", partial(_write_bag, plugin), _read_recording, weight=2)
-            for name, plugin in (("mcap", "mcap"), ("sqlite", "sqlite3"))
-        ),
-        Target("bag_tf", _write_bag_with_tf, _read_recording),
-        Target("tum", lambda at: camera.write_tum(at / "freiburg1", 2), _read_recording),
-        Target(
-            "seven_scenes", lambda at: camera.write_seven_scenes(at / "seq-01", 2), _read_recording
-        ),
-        Target("scan_3rscan", lambda at: sequences.write_sequence(at / "scan", 2), _read_recording),
-        Target("scan_replica", _write_replica, _read_recording),
-        Target("scan_rooms", _write_rooms, _read_recording),
-        *(
-            Target(
-                f"annotations_{layout}",
-                partial(_write_annotations, layout),
-                partial(_read_annotations, layout),
-            )
-            for layout in ("replica", "3rscan")
-        ),
-        Target(
-            "trajectory_tum",
-            lambda at: write_tum(at, [stamp_ns(i) for i in range(4)], [pose(i) for i in range(4)]),
-            _read_trajectory,
-            "poses.txt",
-        ),
-        Target(
-            "trajectory_kitti",
-            lambda path: np.savetxt(path, [pose(i)[:3].ravel() for i in range(4)], "%.9g"),
-            _read_trajectory,
-            "poses.txt",
-        ),
-        Target("trajectory_folder", _write_pose_files, read_trajectory),
-        *(
-            Target(f"ply_{name}", partial(_write_ply, form), _read_ply, "points.ply")
-            for name, form in (("ascii", "ascii"), ("binary", "binary_little_endian"))
-        ),
-        Target(
-            "predictions_json",
-            _write_predictions,
+    }
+    for name, write in made.items():
+        yield Target(name, write, _read_recording)
+    for name, plugin in (("mcap", "mcap"), ("sqlite", "sqlite3")):
+        write = partial(_write_bag, plugin)
+        yield Target(f"bag_{name}", write, _read_recording, weight=2)
+    for layout in ("replica", "3rscan"):
+        write = partial(evaluation.write_dataset, scans=SCANS, layout=layout)
+        yield Target(f"annotations_{layout}", write, partial(_read_annotations, layout))
+
+
+def _others() -> Iterator[Target]:
+    yield Target(
+        "config_yaml",
+        lambda path: path.write_text(to_yaml(Config())),
+        effective_config,
+        "config.yaml",
+        documents=(_CONFIGURATIONS | _PARAMETERS).map(lambda it: json.dumps(it).encode()),
+        weight=2,
+    )
+    yield Target(
+        "set_option",
+        lambda path: path.write_text("output.rate_hz=2.5"),
+        lambda path: effective_config(None, [path.read_bytes().decode(errors="surrogateescape")]),
+        "set.txt",
+        documents=_SETTINGS.map(lambda words: "=".join(words).encode(errors="replace")),
+    )
+    poses = [pose(index) for index in range(4)]
+    trajectories = {
+        "tum": lambda path: write_tum(path, list(map(stamp_ns, range(4))), poses),
+        "kitti": lambda path: np.savetxt(path, [T[:3].ravel() for T in poses], "%.9g"),
+    }
+    for name, write in trajectories.items():
+        yield Target(f"trajectory_{name}", write, _read_trajectory, "poses.txt")
+    yield Target(
+        "trajectory_folder",
+        lambda at: [
+            np.savetxt(at / f"frame-{index:06d}.pose.txt", poses[index], "%.9g")
+            for index in range(2)
+        ],
+        read_trajectory,
+    )
+    points = np.random.default_rng(0).random((5, 3))
+    for name, form in (("ascii", "ascii"), ("binary", "binary_little_endian")):
+        write = partial(evaluation.write_ply, points=points, ids=np.arange(5), form=form)
+        yield Target(f"ply_{name}", write, _read_ply, "points.ply")
+    for protocol in (2, 5):
+        both = {"a": PREDICTION, "b": ScanPrediction.empty(3, 3)}
+        write = partial(evaluation.write_predictions, predictions=both, protocol=protocol)
+        name = f"predictions_pickle_{protocol}"
+        yield Target(name, write, _read_predictions, "predictions.pkl")
+    yield Target("safetensors", _write_headers, hub.read_headers, "model.safetensors")
+    documents = {
+        "predictions_json": (
+            partial(evaluation.write_json, content=OPEN_PREDICTIONS),
             _read_predictions,
             "predictions.json",
-            documents=JSON_DOCUMENTS,
         ),
-        *(
-            Target(
-                f"predictions_pickle_{protocol}",
-                partial(_write_pickle, protocol),
-                _read_predictions,
-                "predictions.pkl",
-            )
-            for protocol in (2, 5)
-        ),
-        Target(
-            "checkpoint_card",
+        "checkpoint_card": (
             lambda path: cards.write_detector_card(path, CARD),
             cards.read_detector_card,
             cards.DETECTOR_CARD,
-            documents=JSON_DOCUMENTS,
         ),
-        Target(
-            "probe_card",
-            lambda folder: cards.write_probe_card(folder, PROBE),
-            _read_probe_card,
-            documents=JSON_DOCUMENTS,
-        ),
-        Target("safetensors", _write_headers, hub.read_headers, "model.safetensors"),
-        Target("scene_graph", _write_graph, graph_files.read_graph, documents=JSON_DOCUMENTS),
-        *wire_targets.TARGETS,
-    )
+        "probe_card": (lambda at: cards.write_probe_card(at, PROBE), _read_probe_card, ""),
+        "scene_graph": (_write_graph, graph_files.read_graph, ""),
+    }
+    for name, (write, read, file) in documents.items():
+        yield Target(name, write, read, file, documents=JSON_DOCUMENTS)
+
+
+TARGETS: dict[str, Target] = {
+    target.name: target for target in (*_maps(), *_recordings(), *_others(), *wire_targets.TARGETS)
 }

@@ -1,7 +1,5 @@
 """Every case that ever failed, and a part of the nightly cases; `scripts/fuzz` runs more."""
 
-from __future__ import annotations
-
 import os
 import signal
 from contextlib import closing

@@ -1,7 +1,5 @@
 """The messages of all topics, and graphs that get hostile but well-formed local graphs."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable
@@ -173,7 +171,6 @@ def _seeded(name: str, use: Callable[[np.random.Generator, Path], object]) -> Ta
 
 
 def _use_hostile_frames(config: Config, rng: np.random.Generator, _: Path) -> None:
-    """A graph that gets local graphs of the worst allowed values."""
     builder, replica = GraphBuilder(config, VOCABULARY, "map"), GraphReplica()
     stamp_ns = 0
     for _ in range(FRAMES):

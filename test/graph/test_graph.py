@@ -2,20 +2,19 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from support.merging import (
     VOCABULARY,
     edit_at_random,
+    node_states,
     random_classes,
     random_covariances,
     seeds,
 )
-from support.node_states import node_states
 
 from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.nodes import PRUNE_ABOVE, NodeIds
-from deworldsg_ros.scene.gaussian import fuse, log_determinant
 
 SURE = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -30,9 +29,6 @@ def graph_of(count: int, **options: int) -> GlobalGraph:
 
 def content(graph: GlobalGraph) -> dict[str, bytes]:
     return {name: values.tobytes() for name, values in graph_files.to_arrays(graph.state()).items()}
-
-
-# --- ids -----------------------------------------------------------------------------------------
 
 
 def test_an_empty_graph() -> None:
@@ -55,15 +51,17 @@ def test_ids_start_at_1_and_are_never_used_again() -> None:
 
 
 @given(seeds)
-@settings(max_examples=40)
 def test_invariants_hold_through_any_edits(seed: int) -> None:
     rng = np.random.default_rng(seed)
     graph = GlobalGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)
     given_ids: set[int] = set()
     gone: set[int] = set()
+    most = 5
     for _ in range(15):
         edit_at_random(graph, rng, 5)
         live = set(graph.nodes.slot_of)
+        most = max(most, len(live) + 5)
+        assert len(graph.nodes.ids) <= most, "free slots are used again"
         assert not live & gone
         gone |= given_ids - live
         given_ids |= live
@@ -72,19 +70,6 @@ def test_invariants_hold_through_any_edits(seed: int) -> None:
         assert {node_id for pair in graph.edges for node_id in pair} <= live
         assert (graph.nodes.surface_counts <= 6).all()
         assert len(graph.state().ids.frames) <= 3
-
-
-def test_frames_are_remembered_up_to_a_number() -> None:
-    graph = graph_of(3, remembered_frames=2)
-    graph.remember_frame(10, [1, 2])
-    graph.remember_frame(20, [3])
-    graph.merge_nodes(1, 2)
-    assert graph.nodes_of_frame(10) == [1, 1]
-    graph.remember_frame(30, [])
-    assert graph.nodes_of_frame(10) is None
-    assert graph.nodes_of_frame(20) == [3]
-    graph.remove_node(3)
-    assert graph.nodes_of_frame(20) == [0]
 
 
 def test_removed_ids_are_forgotten_and_those_of_remembered_frames_are_not() -> None:
@@ -123,41 +108,6 @@ def test_a_new_merge_of_a_node_that_no_remembered_frame_shows_is_not_forgotten()
     assert ids.resolve(1) == 2
 
 
-# --- nodes ---------------------------------------------------------------------------------------
-
-
-def test_nodes_keep_their_slots_and_free_slots_are_used_again() -> None:
-    graph = graph_of(200)
-    slots = dict(graph.nodes.slot_of)
-    for node_id in range(1, 151):
-        graph.remove_node(node_id)
-    nodes = graph.nodes
-    assert len(graph) == len(nodes.slots) == 50
-    free = np.setdiff1d(np.arange(200), nodes.slots)
-    assert not nodes.weights[free].any() and not nodes.covariances[free].any()
-    for node_id in range(201, 251):
-        graph.add_node(np.full(3, 10.0 * (node_id - 1)), np.eye(3), SURE, node_id - 1)
-    assert len(nodes.ids) == 200
-    for node_id in range(151, 251):
-        slot = nodes.slot(node_id)
-        assert slot == slots.get(node_id, slot) and nodes.ids[slot] == node_id
-        assert nodes.means[slot, 0] == 10 * (node_id - 1)
-        assert nodes.first_seen_ns[slot] == node_id - 1
-
-
-def test_observations_average_with_their_weights() -> None:
-    graph = graph_of(1)
-    flat = np.full(4, 0.25000001)  # scaled to one
-    graph.observe(1, np.array([3.0, 0, 0]), np.eye(3), flat, 7)
-    graph.observe(1, np.array([0.0, 0, 0]), np.eye(3), flat, 5)
-    assert graph.nodes.weights.tolist() == [3]
-    assert graph.nodes.means[0] == pytest.approx([1, 0, 0])
-    assert graph.nodes.covariances[0] == pytest.approx(np.diag([3.0, 1, 1]))
-    assert graph.nodes.class_probabilities[0] == pytest.approx([0.5, 1 / 6, 1 / 6, 1 / 6])
-    assert graph.nodes.class_probabilities[0].sum() == pytest.approx(1, abs=1e-15)
-    assert (graph.nodes.first_seen_ns[0], graph.nodes.last_seen_ns[0]) == (0, 7)
-
-
 def test_observing_many_is_observing_each() -> None:
     rng = np.random.default_rng(0)
     means, covariances = rng.normal(size=(3, 3)), random_covariances(rng, 3)
@@ -167,32 +117,9 @@ def test_observing_many_is_observing_each() -> None:
     many.observe_each(ids, means, covariances, classes, 9, surfaces, weights)
     for node_id, *seen, points, weight in zip(ids, means, covariances, classes, surfaces, weights):
         one.observe(node_id, *seen, 9, points, float(weight))
-        slot = many.nodes.slot(node_id)
-        known = (1.0, np.array([10.0 * (node_id - 1), 0, 0]), np.eye(3))
-        mean, covariance = fuse(*known, weight, *seen[:2])
-        assert many.nodes.means[slot] == pytest.approx(mean, rel=1e-14)
-        assert many.nodes.covariances[slot] == pytest.approx(covariance, rel=1e-14)
-        cached = many.nodes.log_determinants[slot]
-        assert cached == log_determinant(many.nodes.covariances[slot])
     none = (np.zeros((0, *shape)) for shape in ((3,), (3, 3), (4,)))
     many.observe_each([], *none, 9, [], np.zeros(0))
     assert content(one) == content(many)
-
-
-def test_room_for_surface_points_grows_with_the_largest_surface() -> None:
-    graph, once = GlobalGraph(VOCABULARY, "world"), GlobalGraph(VOCABULARY, "world")
-    points = np.random.default_rng(0).uniform(size=(700, 3)).astype(np.float32)
-    for node_points in (points[:40], points[40:90]):
-        graph.add_node(np.zeros(3), np.eye(3), SURE, 0, node_points)
-    assert graph.nodes.surface_points_world.shape == (2, 64, 3)
-    other = graph.nodes.surface(1).copy()
-    graph.observe(1, np.zeros(3), np.eye(3), SURE, 1, points[40:140])
-    assert graph.nodes.surface_points_world.shape == (2, 256, 3)
-    graph.observe(1, np.zeros(3), np.eye(3), SURE, 2, points)
-    once.add_node(np.zeros(3), np.eye(3), SURE, 0, points)
-    assert graph.nodes.surface_points_world.shape == (2, 512, 3)
-    np.testing.assert_array_equal(graph.nodes.surface(0), once.nodes.surface(0))
-    np.testing.assert_array_equal(graph.nodes.surface(1), other)
 
 
 def test_invalid_requests_raise_and_change_nothing() -> None:
@@ -207,19 +134,3 @@ def test_invalid_requests_raise_and_change_nothing() -> None:
         with pytest.raises(KeyError, match="node 9"):
             refused()
     assert content(graph) == before
-
-
-# --- messages ------------------------------------------------------------------------------------
-
-
-def test_unchanged_nodes_keep_their_message() -> None:
-    graph = graph_of(3)
-    first = node_states(graph, 2)
-    graph.observe(2, np.ones(3), np.eye(3), SURE, 9)
-    second = node_states(graph, 2)
-    assert [second[node_id] is first[node_id] for node_id in (1, 2, 3)] == [True, False, True]
-    graph.merge_nodes(1, 2)
-    third = node_states(graph, 2)
-    assert list(third) == [1, 3]
-    assert third[1].observations == 3
-    assert third[3] is first[3]

@@ -1,17 +1,12 @@
 """A graph that is saved and read is the same, and goes on alike; other files are refused."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from support.merging import VOCABULARY, edit_at_random, seeds
-from support.node_states import node_states
-from support.old_files import version_1
+from support.merging import VOCABULARY, edit_at_random, node_states, seeds
 
 from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph.graph import GlobalGraph
-from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
 
@@ -33,7 +28,6 @@ def arrays_of(graph: GlobalGraph) -> graph_files.Arrays:
 
 
 @given(seeds)
-@settings(max_examples=25)
 def test_save_and_load_lose_nothing(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     rng = np.random.default_rng(seed)
     graph = random_graph(rng, int(rng.integers(0, 60)))
@@ -73,35 +67,3 @@ def test_a_graph_without_predicates_is_saved_and_loaded() -> None:
     again = graph_files.graph_from_arrays(arrays_of(graph), "saved")
     assert len(again) == 1
     assert_equal(arrays_of(again), arrays_of(graph))
-
-
-@given(seeds)
-@settings(max_examples=10)
-def test_files_of_version_1_are_read(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
-    graph = random_graph(np.random.default_rng(seed), 60)
-    path = tmp_path_factory.mktemp("graph") / "old.npz"
-    graph_files.write(path, version_1(arrays_of(graph)))
-    assert_equal(arrays_of(graph_files.load(path)), arrays_of(graph))
-    graph_files.write(path, version_1(arrays_of(graph), votes=False))
-    first = graph_files.load(path)
-    assert dict(first.edges).keys() == dict(graph.edges).keys()
-    assert not first.votes and (first.nodes.existence == -1.0).all()
-
-
-def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    graph = random_graph(np.random.default_rng(0))
-    graph_files.save(graph, tmp_path / "good.npz")
-    whole = (tmp_path / "good.npz").read_bytes()
-    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
-    (tmp_path / "text.npz").write_text("hello")
-    (tmp_path / "empty.npz").write_bytes(b"")
-    np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    np.save(tmp_path / "array.npy", np.zeros(3))
-    with monkeypatch.context() as later:
-        later.setattr(graph_files, "FORMAT_VERSION", 3)
-        graph_files.save(graph, tmp_path / "version 3.npz")
-    names = ("cut.npz", "text.npz", "empty.npz", "other.npz", "array.npy", "absent.npz")
-    for name in (*names, "version 3.npz"):
-        with pytest.raises(RefusedInput, match=name) as refused:
-            graph_files.load(tmp_path / name)
-        assert refused.value.reason == "invalid_graph_file"

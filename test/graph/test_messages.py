@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.merging import VOCABULARY
-from support.node_states import node_states
+from support.merging import VOCABULARY, node_states
 
 from deworldsg_ros.graph.extent import (
     box_of,
@@ -94,31 +93,6 @@ def test_only_a_real_turn_of_up_makes_new_boxes(points: np.ndarray) -> None:
     assert states.refresh() == [1]
     after = states.states[1]
     assert (before.box.size_m[2], after.box.size_m[2]) == pytest.approx((0.1, 0.4), abs=0.04)
-
-
-def test_extents_of_known_nodes_may_wait(points: np.ndarray) -> None:
-    graph = GlobalGraph(VOCABULARY, "world")
-    for _ in range(3):
-        graph.add_node(points.mean(axis=0), np.eye(3), CLASSES, 1, points)
-    states = NodeStates(graph, 2, even_gaussians=True)
-    assert states.refresh(at_most=1) == [1, 2, 3]  # new nodes do not wait
-    before = dict(states.states)
-    T = np.eye(4)
-    T[0, 3] = 1.0
-    for node_id in (3, 1, 2):
-        graph.move_node(node_id, T)
-        graph.set_classes([node_id], np.array([[0.1, 0.8, 0.05, 0.05]]))
-    assert states.refresh(at_most=1) == [1, 2, 3] and states.waiting == 2
-    assert [state.label for state in states.states.values()] == ["table"] * 3
-    moved = [states.states[i].mean_m[0] - before[i].mean_m[0] for i in (1, 2, 3)]
-    assert moved == pytest.approx([1.0, 0.0, 0.0])
-    assert states.states[2].box is before[2].box
-    graph.observe(1, np.zeros(3), np.eye(3), CLASSES, 2)  # no new points: nothing to measure
-    assert states.refresh(at_most=1) == [1, 2] and states.waiting == 1
-    graph.remove_node(3)
-    assert states.refresh(at_most=1) == [3] and states.waiting == 0
-    assert states.refresh() == []
-    assert all(state.mean_m[0] > before[i].mean_m[0] + 0.9 for i, state in states.states.items())
 
 
 # --- boxes and moments of surfaces ---------------------------------------------------------------

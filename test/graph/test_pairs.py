@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import VOCABULARY
 
@@ -102,23 +102,15 @@ def check_rows(graph: GlobalGraph) -> None:
     for row in used.tolist():
         ids, slots = store.rows["ids"][row], store.rows["slots"][row]
         assert ids[0] < ids[1] and nodes.ids[slots].tolist() == ids.tolist()
-        for slot in slots.tolist():
-            ends[slot].append(row)
         for pair in (slots, slots[::-1]):
+            ends[pair[0]].append(row)
             assert store.find(pair.astype(np.int64)[None]).tolist() == [row]
     for slot, rows in ends.items():
-        found, place = [], int(store.firsts[slot])
-        while place:
-            found.append((place - 1) >> 1)
-            assert store.rows["slots"][found[-1], (place - 1) & 1] == slot
-            place = int(store.rows["links"][found[-1], (place - 1) & 1])
-        assert sorted(found) == rows and store._degrees[slot] == len(rows)
         assert store.of([slot, slot]).tolist() == rows
     assert (np.delete(store.rows, used) == np.zeros((), PAIR)).all()
     for name, sums in (("votes", store.votes), ("logits", store.logits)):
         taken = store.rows[name][used].ravel()
-        taken = taken[taken > 0].tolist()
-        assert len(taken) == len(set(taken)) and not np.delete(sums, taken, axis=0).any()
+        assert not np.delete(sums, taken[taken > 0], axis=0).any()
 
 
 class Follower:
@@ -208,7 +200,6 @@ def change(graph: GlobalGraph, plain: Plain, rng: np.random.Generator) -> None:
         graph.pairs.release(graph.pairs.of(slots))
 
 
-@settings(max_examples=50, deadline=None)
 @given(seed=seeds)
 def test_any_changes_equal_those_of_plain_dicts(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -276,7 +267,6 @@ def test_evidence_for_removed_ids_reaches_their_successors() -> None:
 # --- the votes of a frame ------------------------------------------------------------------------
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=seeds, count=st.integers(0, 4), width=st.integers(0, 6))
 def test_the_votes_of_a_frame_are_a_divided_sigmoid(seed: int, count: int, width: int) -> None:
     logits = np.random.default_rng(seed).normal(0, 5, (count, width))

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.merging import VOCABULARY
-from support.node_states import node_states
+from support.merging import VOCABULARY, node_states
 from support.surfaces import CUP, HERE, depth_grid, frame
 
 from deworldsg_ros.config import MergingConfig
@@ -207,14 +206,6 @@ def test_where_new_nodes_turn_out_to_be_errors_a_new_one_is_less_probable() -> N
         look(records, 0, 0, 0, 0.5)
         found.append(existence_of(records))
     assert found[0] > found[1] + 0.2
-
-
-def test_the_fate_of_a_node_is_counted_once_and_only_after_a_clear_miss() -> None:
-    records = records_of(3)
-    records.rows["missed_since"][:3] = 0.0, 2.0, 0.0
-    for _ in range(2):
-        beliefs.settle(records.rows, records.fates, np.arange(3), np.array([0.95, 0.05, 0.05]))
-        assert records.fates.tolist() == [11, 11]
 
 
 @pytest.mark.parametrize("behind_s", [0, 10**6])

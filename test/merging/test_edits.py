@@ -221,15 +221,6 @@ def test_edits_survive_a_map_and_continue_equally(tmp_path, frames):
     assert again.full().nodes == whole.full().nodes
 
 
-def test_a_map_without_edits_has_no_array_of_them():
-    room = Room((HERE, CUP))
-    for _ in range(2):
-        arrays = copy_state(room.builder)
-        assert not [name for name in arrays if "edit" in name or "aside" in name]
-        room.builder.edit(SetLabel(1, "chair"))
-        room.builder.edit(Undo())
-
-
 @pytest.mark.parametrize(
     ("association", "request_", "message"),
     [

@@ -21,7 +21,6 @@ def deviations(difference: np.ndarray, covariance: np.ndarray) -> float:
 
 
 @given(seeds)
-@settings(max_examples=25)
 def test_match_scores_equal_the_formulas(seed: int) -> None:
     rng = np.random.default_rng(seed)
     local = local_graph(
@@ -89,9 +88,6 @@ def add_frame(
     known: list[int],
     match_scores: ArrayLike,
     touching: ArrayLike | None = None,
-    *,
-    detection_scores: ArrayLike = 0.9,
-    on_nodes: ArrayLike = 0.0,
     camera_m: float = 0.0,
 ) -> None:
     """One frame of objects; unless told, each touches the slots with which it has a score."""
@@ -99,11 +95,8 @@ def add_frame(
     scores = np.array(match_scores, float).reshape(shape)
     touching = scores > 0 if touching is None else np.array(touching, bool).reshape(shape)
     matched = [known.index(slot) if slot in known else -1 for slot in seen]
-    matches = matching.Matches(
-        np.array(known), np.broadcast_to(on_nodes, shape), scores, touching, matched
-    )
-    detection_scores = np.broadcast_to(detection_scores, len(seen))
-    evidence.add_frame(seen, matches, detection_scores, np.array([camera_m, 0, 0]))
+    matches = matching.Matches(np.array(known), np.zeros(shape), scores, touching, matched)
+    evidence.add_frame(seen, matches, np.full(len(seen), 0.9), np.array([camera_m, 0, 0]))
 
 
 BOTH = ([4], [4, 7], [[1, 1]])
@@ -134,33 +127,6 @@ def test_after_a_wide_step_one_frame_that_overlaps_both_is_enough() -> None:
     assert evidence.next_merge() is None
     add_frame(evidence, [4], [4, 8], [[1, 1]], camera_m=2 * matching.WIDE_STEP_M)
     assert evidence.next_merge() == (4, 8)
-
-
-NESTED = np.array([[1, 0], [matching.NESTED_FRACTION, 1]])
-TOUCHING = np.array([[1, 0], [1, 1]])
-
-
-@pytest.mark.parametrize(
-    "detection_score, on_nodes, touching, balance",
-    [
-        (matching.SURE_SCORE - 0.01, NESTED, TOUCHING, matching.TOUCHING_WEIGHT),
-        (matching.SURE_SCORE - 0.01, 0.9 * NESTED, TOUCHING, -matching.OVERLAPPING_WEIGHT),
-        (
-            matching.SURE_SCORE - 0.01,
-            NESTED,
-            np.eye(2),
-            -matching.OVERLAPPING_WEIGHT,
-        ),  # classes differ
-        (matching.SURE_SCORE, NESTED, TOUCHING, -matching.SEPARATE_WEIGHT),
-    ],
-)
-def test_an_unsure_box_in_a_box_may_be_the_same_object(
-    detection_score: float, on_nodes: np.ndarray, touching: np.ndarray, balance: int
-) -> None:
-    evidence, scores = matching.JointEvidence(), [0.9, detection_score]
-    more = {"detection_scores": scores, "on_nodes": on_nodes}
-    add_frame(evidence, [4, 7], [4, 7], np.eye(2), touching, **more)
-    assert evidence.balances == {(4, 7): balance}
 
 
 def test_a_merged_node_keeps_the_separations_of_both_parts() -> None:

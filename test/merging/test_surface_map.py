@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from support.merging import VOCABULARY, random_pose
-from support.node_states import node_states
+from support.merging import VOCABULARY, node_states, random_pose
 from support.surfaces import CAMERA, CUP, TABLE, frame
 
 from deworldsg_ros.config import Config, MergingConfig
@@ -63,7 +62,6 @@ def dense(owners: list[int], on: np.ndarray, of: np.ndarray, owner_count: int) -
 
 
 @given(seeds)
-@settings(max_examples=30)
 def test_overlaps_equal_the_reference(seed: int) -> None:
     rng, cell_m = np.random.default_rng(seed), 0.05
     surfaces = VoxelMap(cell_m)
@@ -184,7 +182,6 @@ def cells_in(sets: CellSets, row: int) -> set[Cell]:
 
 
 @given(seeds)
-@settings(max_examples=30, deadline=None)
 def test_scores_equal_the_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
     surfaces, plain = VoxelMap(), [PlainScores(), PlainScores()]

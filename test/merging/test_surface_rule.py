@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from support.merging import VOCABULARY
-from support.node_states import node_states
+from support.merging import VOCABULARY, node_states
 from support.surfaces import (
     CAMERA,
     CHAIR,

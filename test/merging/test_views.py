@@ -136,7 +136,6 @@ def shows(
 
 
 @given(seeds)
-@settings(max_examples=40, deadline=None)
 def test_every_node_in_view_is_found_after_any_changes(seed: int) -> None:
     rng = np.random.default_rng(seed)
     grid, known = views.NodeGrid(), {}

@@ -1,7 +1,5 @@
 """Abnormal input on each live topic: it is counted under its reason, and the node continues."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from functools import partial

@@ -1,17 +1,14 @@
 """Four node processes over DDS: the graph, its updates, its file, and the end of the nodes."""
 
-from __future__ import annotations
-
 import itertools
-from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
 from std_srvs.srv import Trigger
 from support.cli import DEMO_ROOM
-from support.nodes import Camera, NodeProcess, Peer, peer
+from support.nodes import Camera, NodeProcess, peer
 from visualization_msgs.msg import MarkerArray
 
 from deworldsg_ros.config import Config
@@ -37,35 +34,26 @@ LIMIT_S = 60.0
 pytestmark = pytest.mark.timeout(240)
 
 
-@dataclass
-class Run:
-    """The output of four nodes for the first frames of a recording."""
+def values_of(run):
+    """The newest diagnostics, by node."""
+    return {
+        status.name.split(":")[0]: {item.key: item.value for item in status.values}
+        for status in run.statuses
+    }
 
-    processes: dict[str, NodeProcess]
-    peer: Peer
-    statuses: list[DiagnosticStatus]
-    graphs: list[str]
-    updates: list[str]
-    evidence: list[str]
-    markers: list[MarkerArray] = field(default_factory=list)
 
-    def values(self) -> dict[str, dict[str, str]]:
-        """The newest diagnostics, by node."""
-        return {
-            status.name.split(":")[0]: {item.key: item.value for item in status.values}
-            for status in self.statuses
-        }
+def are_nodes_connected(run):
+    told = {key: value for values in values_of(run).values() for key, value in values.items()}
+    return all(int(told.get(f"{LISTENERS}{topic}", 0)) >= n for topic, n in BETWEEN.items())
 
-    def are_nodes_connected(self) -> bool:
-        told = {key: value for values in self.values().values() for key, value in values.items()}
-        return all(int(told.get(f"{LISTENERS}{topic}", 0)) >= n for topic, n in BETWEEN.items())
 
-    def latest(self) -> wire.SceneGraphMessage:
-        return wire.decode(self.graphs[-1], wire.SceneGraphMessage)
+def latest(run):
+    return wire.decode(run.graphs[-1], wire.SceneGraphMessage)
 
-    def associations(self) -> list[wire.Association]:
-        decoded = [wire.decode(text, wire.SceneGraphUpdateMessage) for text in self.updates]
-        return [item for update in decoded for item in update.associations]
+
+def associations(run):
+    decoded = [wire.decode(text, wire.SceneGraphUpdateMessage) for text in run.updates]
+    return [item for update in decoded for item in update.associations]
 
 
 @pytest.fixture(scope="module")
@@ -83,24 +71,24 @@ def run(tmp_path_factory):
         for process in processes.values():
             process.wait_ready()
         with peer() as me:
-            result = Run(
-                processes,
-                me,
-                me.statuses(),
-                me.collect("/scene_graph", 1, latched=True),
-                me.collect("/scene_graph/updates"),
-                me.collect("deworldsg/relation_evidence"),
-                me.listen(MarkerArray, "/scene_graph/markers", 1, latched=True),
+            result = SimpleNamespace(
+                processes=processes,
+                peer=me,
+                statuses=me.statuses(),
+                graphs=me.collect("/scene_graph", 1, latched=True),
+                updates=me.collect("/scene_graph/updates"),
+                evidence=me.collect("deworldsg/relation_evidence"),
+                markers=me.listen(MarkerArray, "/scene_graph/markers", 1, latched=True),
             )
             camera = Camera(me, messages)
             camera.wait_for_subscribers()
-            me.spin_until(result.are_nodes_connected, LIMIT_S, "the nodes to connect")
+            me.spin_until(lambda: are_nodes_connected(result), LIMIT_S, "the nodes to connect")
             for count, _ in enumerate(camera.frames(), 1):
                 # Nodes that fall behind drop frames: one at a time, and the next for its pose.
                 me.spin_until(lambda n=count: len(result.evidence) >= n - 1, LIMIT_S, "evidence")
             me.spin_until(lambda: len(result.evidence) >= FRAMES, LIMIT_S, "all evidence")
             # A start with an empty cache compiles for seconds.
-            me.spin_until(lambda: len(result.associations()) >= FRAMES, LIMIT_S, "all frames")
+            me.spin_until(lambda: len(associations(result)) >= FRAMES, LIMIT_S, "all frames")
             # What waits to be measured and judged comes with further updates. The whole graph
             # follows once a second.
             known = 0
@@ -114,11 +102,11 @@ def run(tmp_path_factory):
 
 
 def test_the_updates_rebuild_the_published_graph_exactly(run):
-    graph = run.latest()
+    graph = latest(run)
     assert graph.nodes
     assert graph.frame_id
     assert {node.id for node in graph.nodes} >= {edge.subject for edge in graph.edges}
-    assert len(run.associations()) == FRAMES
+    assert len(associations(run)) == FRAMES
     replica = GraphReplica()
     for text in run.updates:
         assert replica.apply(wire.decode(text, wire.SceneGraphUpdateMessage))
@@ -132,7 +120,7 @@ def test_one_process_gives_the_same_graph(run):
         pipeline.process(frame)
     while pipeline.builder.update() or pipeline.builder.waiting:
         pass
-    ours, theirs = pipeline.builder.snapshot(), run.latest()
+    ours, theirs = pipeline.builder.snapshot(), latest(run)
     assert [(node.id, node.label, node.observations) for node in ours.nodes] == [
         (node.id, node.label, node.observations) for node in theirs.nodes
     ]
@@ -152,14 +140,14 @@ def test_a_late_subscriber_gets_the_graph(run):
 
 def test_markers_are_published(run):
     run.peer.spin_until(lambda: bool(run.markers), LIMIT_S, "markers")
-    assert len(run.markers[-1].markers) > len(run.latest().nodes)
-    assert {marker.header.frame_id for marker in run.markers[-1].markers} == {run.latest().frame_id}
+    assert len(run.markers[-1].markers) > len(latest(run).nodes)
+    assert {marker.header.frame_id for marker in run.markers[-1].markers} == {latest(run).frame_id}
 
 
 def test_every_node_publishes_diagnostics(run):
-    run.peer.spin_until(lambda: run.values().keys() >= set(NODES), LIMIT_S, "diagnostics")
+    run.peer.spin_until(lambda: values_of(run).keys() >= set(NODES), LIMIT_S, "diagnostics")
     for name in NODES:
-        values = run.values()[name]
+        values = values_of(run)[name]
         assert int(values["total"]) > 0
         assert not any(key.startswith("dropped") for key in values), values
 
@@ -172,7 +160,7 @@ def test_the_graph_is_saved_on_request(run):
     assert future.result().success, future.result().message
     path = Path(future.result().message.split(":")[0])
     saved = wire.decode(path.read_bytes(), wire.SceneGraphMessage)
-    assert [node.id for node in saved.nodes] == [node.id for node in run.latest().nodes]
+    assert [node.id for node in saved.nodes] == [node.id for node in latest(run).nodes]
     assert all(len(surface_points(node)) for node in saved.nodes)
 
 

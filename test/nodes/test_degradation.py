@@ -1,7 +1,5 @@
 """A model that raises, hangs or is lost: its stage goes on, says so, and recovers by itself."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -62,15 +60,10 @@ def with_faults(*faults: dict[str, Any]):
 
 
 def objects_after_a_frame(at: Bench) -> int:
-    """Send a frame; the number of objects in its frame graph."""
     at.texts.clear()
     works(at, lambda: send_frame(at))
     at.expect(lambda: bool(at.texts), "a frame graph")
     return len(wire.decode(at.texts[-1], wire.FrameGraphMessage).objects)
-
-
-def drops(at: Bench, reason: str) -> int:
-    return int(at.node.health.drops.get(reason, 0))
 
 
 def warns(at: Bench, words: str) -> bool:
@@ -87,7 +80,7 @@ def test_a_model_that_raises_is_counted_and_the_node_continues(at, loaded_on, re
         assert warns(at, f"the {part.replace('_', ' ')} fails: injected fault")
         # Without detections the frame has no product.
         at.expect(lambda n=products: (at.products() > n) is (part != "detector"), "a product")
-        assert drops(at, f"{part}_error") == count
+        assert at.node.health.drops[f"{part}_error"] == count
     assert objects_after_a_frame(at) > 0
     assert not warns(at, f"the {part.replace('_', ' ')}")
     assert loaded_on == ["auto"]
@@ -97,7 +90,7 @@ def test_a_model_that_raises_is_counted_and_the_node_continues(at, loaded_on, re
 def test_a_segmenter_that_hangs_gives_frames_without_objects(at):
     assert objects_after_a_frame(at) == 0
     assert objects_after_a_frame(at) == 0
-    assert drops(at, "segmenter_error") == 2
+    assert at.node.health.drops["segmenter_error"] == 2
     assert warns(at, "the segmenter has given no result for")
     at.peer.spin_for(HANG_S)
     assert objects_after_a_frame(at) > 0

@@ -1,7 +1,5 @@
 """Tables of the pages equal the code; `python test/nodes/test_docs.py` writes them."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys
@@ -39,7 +37,6 @@ def reasons_table() -> str:
 
 
 def parameters_table(kind: type, section: str = "") -> str:
-    """All parameters, or those of one section."""
     rows = []
     for field in fields(kind):
         if section in ("", field.path[0]):

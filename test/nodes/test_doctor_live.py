@@ -1,7 +1,5 @@
 """`deworldsg doctor --live`: diagnostics, publishers and stamps of running nodes."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

@@ -1,7 +1,5 @@
 """Parameters that change while a node runs, those that do not, and the QoS of its topics."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -12,7 +10,7 @@ from support.nodes_bench import CAMERA, Bench, alone, fake_perception, send_fram
 from deworldsg_ros.nodes.deworldsg_node import DeworldsgNode
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
-from deworldsg_ros.ros.node import StageNode
+from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.parameters import fields
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -118,3 +116,19 @@ def test_an_override_that_rclpy_does_not_take_is_refused(policy, value):
     refused = pytest.raises(ConfigurationError, match=f"{policy} = {value!r}: .*expected policies")
     with refused, alone(GraphNode, {f"qos_overrides.{UPDATES}.{policy}": value}):
         pass
+
+
+def test_a_node_whose_start_fails_leaves_nothing_to_dds():
+    ended = []
+
+    class Failing(StageNode):
+        def __init__(self):
+            super().__init__("failing", "nothing")
+            raise ConfigurationError("crystal ball")
+
+        def destroy_node(self):
+            super().destroy_node()
+            ended.append(self)
+
+    assert run(Failing, []) == 2
+    assert len(ended) == 1

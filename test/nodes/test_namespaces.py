@@ -1,9 +1,6 @@
 """Two robots in two namespaces keep two graphs apart."""
 
-from __future__ import annotations
-
 import contextlib
-from functools import partial
 
 from std_msgs.msg import String
 from support.nodes_bench import Bench, local_graph
@@ -12,12 +9,6 @@ from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.wire import messages as wire
 
 LOCAL = "deworldsg/local_graph"
-
-
-def seen_at(x_m: float, stamp_ns: int) -> wire.LocalGraphMessage:
-    message = local_graph(stamp_ns)
-    message.objects[0].mean_m = [x_m, 0.0, 1.0]
-    return message
 
 
 def test_two_robots_keep_two_graphs_apart():
@@ -38,7 +29,9 @@ def test_two_robots_keep_two_graphs_apart():
         for robot, at in benches.items():
             topic = f"{robot}/{LOCAL}".replace("/", "__")
             for _ in range(12):
-                at.send_made(**{topic: partial(seen_at, robots[robot])})
+                message = local_graph(at.next_stamp())
+                message.objects[0].mean_m = [robots[robot], 0.0, 1.0]
+                at.send(**{topic: message})
         names = {f"graph_node: {robot}/graph_node" for robot in robots}
         peer.spin_until(
             lambda: all(updates.values()) and {status.name for status in statuses} == names,
@@ -50,8 +43,7 @@ def test_two_robots_keep_two_graphs_apart():
             decoded = [wire.decode(text, wire.SceneGraphUpdateMessage) for text in updates[robot]]
             assert {node.mean_m[0] for update in decoded for node in update.nodes} == {x_m}
             sessions |= {update.session for update in decoded}
-        assert len(sessions) == 2
-        assert shared == []
+        assert len(sessions) == 2 and shared == []
         services = dict(peer.node.get_service_names_and_types())
         assert {f"{robot}/graph_node/save" for robot in robots} <= services.keys()
         for robot in robots:

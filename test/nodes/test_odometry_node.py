@@ -1,7 +1,5 @@
 """odometry_node: poses from images, lost frames, the transform on /tf."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -11,11 +9,12 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, Image
 from support.corner_room import INTRINSICS, LEVEL, corner_frame, walk
 from support.nodes_bench import Bench, camera_info, changed, image, works
-from support.streams import tf, transform
+from support.recordings import tf
+from support.streams import at as pose_at
 
 from deworldsg_ros.nodes.odometry_node import OdometryNode
 from deworldsg_ros.ros.transforms import camera_transform
-from deworldsg_ros.scene.camera import invert_pose, rigid_motion
+from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.streams.poses import (
     TransformTree,
     pose_from_message,
@@ -111,19 +110,15 @@ def test_one_wrong_stamp_costs_a_frame_and_a_restarted_recording_restarts(odomet
     np.testing.assert_allclose(pose_from_message(poses[5])[0], LEVEL, atol=1e-12)
 
 
-def at(x: float = 0.0, y: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
-    return rigid_motion(np.array([x, y, 0.0]), np.array([0.0, 0.0, turn_rad]))
-
-
 def test_the_root_of_the_mounting_is_published_on_tf():
     """A frame has one parent in TF, and the optical frame has one already."""
-    tree, stamp_ns, T = TransformTree(0), 1_700_000_000_123_456_789, at(1.0, 2.0, 0.5)
+    tree, stamp_ns, T = TransformTree(0), 1_700_000_000_123_456_789, pose_at(1.0, 2.0, 0.5)
     alone = camera_transform(tree, stamp_ns, "odom", "optical", T)
     assert (alone.header.frame_id, alone.child_frame_id) == ("odom", "optical")
     np.testing.assert_allclose(pose_from_transform(alone.transform), T, atol=1e-12)
-    link_color, color_optical = at(0.0, 0.015), at(turn_rad=1.5)
-    tree.add(tf(transform("camera_link", "color", link_color)), static=True)
-    tree.add(tf(transform("color", "optical", color_optical)), static=True)
+    link_color, color_optical = pose_at(0.0, 0.015), pose_at(turn_rad=1.5)
+    mounting = (("camera_link", "color", link_color), ("color", "optical", color_optical))
+    tree.add(tf(0, *mounting), static=True)
     mounted = camera_transform(tree, stamp_ns, "odom", "optical", T)
     assert (mounted.child_frame_id, stamp_ns_of(mounted)) == ("camera_link", stamp_ns)
     T_world_link = pose_from_transform(mounted.transform)

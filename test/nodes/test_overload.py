@@ -1,7 +1,5 @@
 """What hangs, stalls or floods does not stop a node: queues are bounded, losses counted."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time
@@ -140,7 +138,7 @@ def test_a_node_that_does_not_keep_up_goes_on_with_the_newest_image(whole, monke
         return decode(message)
 
     monkeypatch.setattr(frames, "rgb_from_message", note)
-    waiting = Waiting(whole.node, whole._executor)
+    waiting = Waiting(whole.node, whole.executor)
     whole.peer.also_spin.clear()
     worker = whole.node._worker
 

@@ -1,7 +1,5 @@
 """A node process: its parameters at the start, SROS2, and its heap."""
 
-from __future__ import annotations
-
 import os
 import platform
 import re

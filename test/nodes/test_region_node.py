@@ -1,9 +1,5 @@
 """region_node: a client of its topics has the part, also when the centre or the region changes."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import msgspec
 import pytest
 from geometry_msgs.msg import PoseStamped
@@ -12,6 +8,7 @@ from std_msgs.msg import String
 from support.nodes import NodeProcess, peer
 from support.nodes_bench import alone
 from support.reference_updates import diff
+from support.view import SAVED
 
 from deworldsg_ros.client import SceneGraph, SceneGraphClient
 from deworldsg_ros.nodes.region_node import RegionNode, region_of
@@ -20,7 +17,7 @@ from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.wire import messages as wire
 
-ROOM = SceneGraph.load(Path(__file__).parents[1] / "client" / "saved" / "scene_graph_v1.json")
+ROOM = SceneGraph.load(SAVED)
 LIMIT_S = 60.0
 
 

@@ -1,7 +1,5 @@
 """A replay waits for a pipeline that works, and keeps its own pace without one."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -159,14 +157,3 @@ def test_counts_of_a_restarted_node_begin_again(monitor):
     assert monitor.drained(10 * EVIDENCE_QUIET_S)
     monitor.result(27)
     assert not monitor.drained(20 * EVIDENCE_QUIET_S)
-
-
-def test_values_of_others_that_are_no_counts_are_left_out(monitor):
-    """/diagnostics is shared with other programs."""
-    keys = ("nodes", "clips pending", "dropped x", "listeners of deworldsg/frame_graph", RECEIVED)
-    for name in ("segmentation_node", "lifting_node", "relation_node", "graph_node"):
-        monitor.tell(name, dict.fromkeys(keys, "1.0 per second, many in total"))
-    assert monitor.nodes == 0 and monitor.window.in_flight == WINDOW_FRAMES
-    assert monitor.connections.missing({}, 100.0) != []
-    monitor.window.give_up()
-    assert monitor.drained(100.0)

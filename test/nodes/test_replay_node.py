@@ -1,7 +1,5 @@
 """replay_node: published messages, waiting, exit codes."""
 
-from __future__ import annotations
-
 import signal
 
 import msgspec
@@ -10,7 +8,7 @@ from geometry_msgs.msg import PoseStamped
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from support.nodes import NodeProcess, peer, run_to_end, wait_until
-from support.recordings import camera_items, pose, stamp_ns, transform, write_bag
+from support.recordings import camera_items, pose, stamp_ns, tf, write_bag
 
 from deworldsg_ros.recordings import replaying, source
 from deworldsg_ros.streams.poses import stamp_ns_of
@@ -83,7 +81,7 @@ def test_messages_of_a_bag_arrive_byte_for_byte(tmp_path, bag):
 def test_poses_from_tf_are_published_as_poses(tmp_path):
     items = camera_items(COUNT, with_pose=False)
     for i in range(COUNT):
-        moving = transform(stamp_ns(i), "map", "camera_optical", pose(i))
+        moving = tf(stamp_ns(i), ("map", "camera_optical", pose(i)))
         items.append(("/tf", source.TF_MESSAGE, stamp_ns(i), moving))
     bag = write_bag(tmp_path / "bag", sorted(items, key=lambda item: item[2]))
     messages, _ = received(tmp_path, bag)
@@ -108,7 +106,7 @@ def test_without_the_nodes_it_replays_at_the_recorded_rate(tmp_path, bag):
 def test_a_signal_ends_it_with_0(tmp_path, bag, number):
     with NodeProcess("replay_node", tmp_path, **options(bag, rate=0.02)) as process:
         wait_until(lambda: '"Started"' in process.log, 30, "the replay to start")
-        process._process.send_signal(number)
+        process.send_signal(number)
         assert process.wait(10) == 0, process.log
         assert "Traceback" not in process.log
 

@@ -1,7 +1,5 @@
 """The services of graph_node, called by the live client, the command line, and as ROS does."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import shutil
@@ -40,7 +38,7 @@ class Robot(Bench):
         files = {"map_path": str(folder / "a.map"), "save_path": str(folder / "a.json")}
         values = {"output.min_existence": 0.0, "inputs.world_up": "z", **files}
         super().__init__(GraphNode, {"deworldsg/local_graph": String}, parameters=values)
-        self._threads = ThreadPoolExecutor(1)
+        self._threads = self.enter_context(ThreadPoolExecutor(1))
         self._seen = 0
 
     def see(self, frames=1):
@@ -57,7 +55,6 @@ class Robot(Bench):
         return future.result()
 
     def call(self, kind, topic, request):
-        """The response to `ros2 service call`."""
         client = self.peer.node.create_client(kind, topic)
         self.expect(client.service_is_ready, "the service")
         future = client.call_async(request)
@@ -65,17 +62,12 @@ class Robot(Bench):
         return future.result()
 
     def command(self, *words):
-        """Output of the command line."""
         done = self.ask(typer.testing.CliRunner().invoke, app, list(words))
         assert done.exit_code == 0, done.output
         return done.output
 
     def refusals(self):
         return self.node.health.drops.get("invalid_request", 0)
-
-    def close(self):
-        self._threads.shutdown()
-        super().close()
 
 
 @pytest.fixture

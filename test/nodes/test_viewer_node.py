@@ -1,7 +1,5 @@
 """viewer_node: topics become a graph and joined frames; abnormal messages change nothing."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import numpy as np
@@ -46,7 +44,6 @@ def at(monkeypatch):
 
 
 def cup_update(sequence, stamp_ns=0):
-    """An update with one more cup."""
     stamp = wire.stamp_from_ns(stamp_ns)
     graph = replace(make_graph([make_node(sequence, "cup")]), stamp=stamp, sequence=sequence)
     before = replace(graph, sequence=sequence - 1, nodes=[])

@@ -1,6 +1,5 @@
 """`python -m bench`: each benchmark has a process of its own, and may fail alone."""
 
-import importlib
 import json
 import sys
 
@@ -36,9 +35,3 @@ def test_a_benchmark_that_fails_leaves_the_others_their_figures():
     assert "KeyError: 'failing'" in report["benchmarks"]["failing"]["error"]
     assert report["benchmarks"]["slow"]["error"] == "ended after 0.01 s"
     assert {figure["benchmark"] for figure in report["figures"]} == {"lifting"}
-
-
-@pytest.mark.parametrize("entry", ENTRIES.values(), ids=lambda entry: entry.name)
-def test_every_entry_names_a_function(entry):
-    module, _, name = entry.function.partition(":")
-    assert callable(getattr(importlib.import_module(module), name))

@@ -1,7 +1,5 @@
 """The choices that scripts/bootstrap.sh makes before it installs anything."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -36,7 +36,6 @@ FETCHED = re.compile(
 
 @cache
 def tracked() -> tuple[Path, ...]:
-    """Files of the repository that are in version control and still there."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     paths = (Path(line) for line in listed.stdout.splitlines())
@@ -54,8 +53,6 @@ def anchors(text: str) -> set[str]:
 
 
 def broken_links(page: Path, text: str) -> list[str]:
-    """Relative links of a page to a file or a heading that does not exist."""
-
     def is_broken(link: str) -> bool:
         name, _, anchor = link.partition("#")
         target = (page.parent / name).resolve() if name else page
@@ -69,20 +66,16 @@ def broken_links(page: Path, text: str) -> list[str]:
 
 
 def missing_files(text: str) -> list[str]:
-    """Source files named in backticks that the repository does not contain.
-
-    A name may leave out leading folders: `lifting/stage.py`, `stage.py`. Names with a placeholder
-    in capitals (`NAME.py`) are not checked.
-    """
+    """Source files named in backticks, perhaps without leading folders, that do not exist."""
     ends = {"/".join(path.parts[start:]) for path in tracked() for start in range(len(path.parts))}
     words = [word for code in CODE.findall(FENCE.sub("", text)) for word in code.split()]
     names = [word for word in words if SOURCE_PATH.fullmatch(word)]
+    # Not names with a placeholder in capitals (`NAME.py`).
     checked = [re.sub(r"^(\.\./)+", "", name) for name in names if not Path(name).stem.isupper()]
     return [name for name in checked if name not in ends | ELSEWHERE]
 
 
 def defined_in(path: Path) -> set[str]:
-    """Names of all functions and classes of a module."""
     kinds = (ast.FunctionDef, ast.ClassDef)
     tree = ast.parse(path.read_text(encoding="utf-8"))
     return {node.name for node in ast.walk(tree) if isinstance(node, kinds)}

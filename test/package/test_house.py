@@ -1,7 +1,5 @@
 """The limits that keep the package readable; tools/house.py measures."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import subprocess

@@ -47,17 +47,13 @@ def run(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str
 
 def copy_sources(root: Path, target: Path) -> Path:
     """A copy, because both builders leave files beside what they build."""
-    ignore = shutil.ignore_patterns("__pycache__")
     for name in SOURCES:
-        if (root / name).is_dir():
-            shutil.copytree(root / name, target / name, ignore=ignore)
-        else:
-            shutil.copy2(root / name, target / name)
+        copy = shutil.copytree if (root / name).is_dir() else shutil.copy2
+        copy(root / name, target / name)
     return target
 
 
 def install_with_pip(source: Path, folder: Path) -> Path:
-    """The prefix of a `pip install .`."""
     # Without --ignore-installed pip would first uninstall the package from this environment.
     options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--ignore-installed")
     pip = (sys.executable, "-m", "pip", "install", *options)
@@ -67,7 +63,6 @@ def install_with_pip(source: Path, folder: Path) -> Path:
 
 
 def install_with_colcon(source: Path, folder: Path) -> Path:
-    """The prefix of a `colcon build`."""
     colcon = shutil.which("colcon", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     assert colcon is not None, "colcon is missing: scripts/test installs it"
     done = run(colcon, "--log-base", "log", "build", "--base-paths", source, cwd=folder)
@@ -80,7 +75,6 @@ BUILDERS = {"pip": install_with_pip, "colcon": install_with_colcon}
 
 @pytest.fixture(scope="module", params=sorted(BUILDERS))
 def install(request, root_dir, tmp_path_factory):
-    """The package, installed in one of the two ways."""
     folder = tmp_path_factory.mktemp(request.param)
     prefix = BUILDERS[request.param](copy_sources(root_dir, folder / "source"), folder)
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
@@ -88,7 +82,6 @@ def install(request, root_dir, tmp_path_factory):
 
 
 def files_below(folder: Path) -> set[str]:
-    """The data files below a folder, relative to it."""
     return {
         path.relative_to(folder).as_posix()
         for path in folder.rglob("*")

@@ -1,7 +1,5 @@
 """All kernels of a run are compiled before its first frame, each for one layout."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import subprocess
@@ -20,7 +18,6 @@ FRAMES = 60
 
 
 def signatures() -> dict[str, set[object]]:
-    """Compiled signatures of each kernel of the package."""
     modules = [module for name, module in sys.modules.items() if name.startswith("deworldsg_ros.")]
     kernels = {item for module in modules for item in vars(module).values()
                if isinstance(item, Dispatcher)}  # fmt: skip

@@ -10,20 +10,17 @@ import pytest
 from deworldsg_ros.ros.node import RESPAWN_VARIABLE
 
 
-class Kept:
-    """Test double of a class of launch: it keeps its arguments."""
-
-    def __init__(self, *args, **kwargs):
-        self.args, self.kwargs = args, kwargs
-
-
 class Doubles(ModuleType):
-    """Any class of a module of launch, as a test double."""
+    """Any class of a module of launch, as a test double that keeps its arguments."""
 
     def __getattr__(self, name):
         if name.startswith("_"):
             raise AttributeError(name)
-        return type(name, (Kept,), {})
+
+        def keep(self, *args, **kwargs):
+            self.args, self.kwargs = args, kwargs
+
+        return type(name, (), {"__init__": keep})
 
 
 MODULES = (
@@ -40,7 +37,6 @@ def launch_doubles(monkeypatch):
 
 
 def described(path):
-    """Entities of a launch file, by kind."""
     (entities,) = runpy.run_path(str(path))["generate_launch_description"]().args
     found = defaultdict(list)
     for entity in entities:

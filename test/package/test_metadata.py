@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from support.requirements import required
 
 import deworldsg_ros
 from deworldsg_ros.config import Config, load_config, to_mapping
@@ -18,15 +19,6 @@ DISTRIBUTIONS = {
     **{"foxglove": "foxglove-sdk", "zenoh": "eclipse-zenoh", "cv2": "opencv-python-headless"},
     **{"yaml": "pyyaml", "huggingface_hub": "huggingface-hub"},
 }
-
-
-def requirements(root: Path, *extras: str) -> dict[str, str]:
-    """Requirement lines by lower-case distribution name."""
-    script = root / "scripts" / "requirements.py"
-    done = subprocess.run(
-        [sys.executable, script, *extras], capture_output=True, text=True, check=True, timeout=60
-    )
-    return {re.split(r"[<>=!]", line)[0].lower(): line for line in done.stdout.split()}
 
 
 def test_versions_descriptions_licences_and_ros_packages_agree(root_dir):
@@ -48,21 +40,20 @@ def test_versions_descriptions_licences_and_ros_packages_agree(root_dir):
 
 
 def imported_modules(root: Path) -> set[str]:
-    """Top-level names of everything that the package imports."""
     texts = [path.read_text(encoding="utf-8") for path in (root / "deworldsg_ros").rglob("*.py")]
     found = r"^ *(?:from|import) (\w+)(?=[\w.]* import |$| as )"
     return {name for text in texts for name in re.findall(found, text, re.M)}
 
 
 def test_every_imported_library_is_a_requirement(root_dir):
-    extras = ("models", "cluster", "mcp", "networkx", "fleet", "store", "view", "foxglove")
+    extras = ("run", "models", "cluster", "mcp", "networkx", "fleet", "store", "view", "foxglove")
     libraries = {
         DISTRIBUTIONS.get(name, name).lower()
         for name in imported_modules(root_dir) - set(sys.stdlib_module_names)
         if name not in ("deworldsg_ros", "__future__") and not re.fullmatch(ROS_NAMES, name)
     }
     assert {"numpy", "msgspec", "torch"} <= libraries
-    assert libraries <= {*requirements(root_dir), *requirements(root_dir, *extras)}
+    assert libraries <= {item.name.lower() for item in required(root_dir, *extras)}
 
 
 @pytest.mark.parametrize(
@@ -80,9 +71,10 @@ def test_a_shipped_configuration_contains_only_changed_values(root_dir, name):
 
 
 def test_run_time_requirements_are_bounded_and_without_torch(root_dir):
-    lines = requirements(root_dir)
-    assert {"numpy", "scipy", "rosbags"} <= set(lines)
-    assert all(re.fullmatch(r"[\w.-]+>=[\d.]+,<[\d.]+", line) for line in lines.values())
-    assert not {"torch", "transformers"} & set(lines)
+    run_time = required(root_dir, "run")
+    names = {item.name for item in run_time}
+    assert {"numpy", "scipy", "rosbags"} <= names and not {"torch", "transformers"} & names
+    for item in run_time:
+        assert sorted(spec.operator for spec in item.specifier) == ["<", ">="], item
     with pytest.raises(subprocess.CalledProcessError):
-        requirements(root_dir, "no-such-extra")
+        required(root_dir, "no-such-extra")

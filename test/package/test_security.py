@@ -17,14 +17,12 @@ ANYWHERE = ("0.0.0.0", "::", "[::]")
 
 
 def sources(root: Path) -> Iterator[tuple[str, ast.Module]]:
-    """Name and tree of each file that users run."""
     for folder in ("deworldsg_ros", "tools", "bench", "launch"):
         for path in sorted((root / folder).rglob("*.py")):
             yield path.relative_to(root).as_posix(), ast.parse(path.read_text(encoding="utf-8"))
 
 
 def calls(tree: ast.Module) -> Iterator[tuple[str, str, ast.Call]]:
-    """Owner and name of each called attribute."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             yield ast.unparse(node.func.value), node.func.attr, node

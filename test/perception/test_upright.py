@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.failing_backend import Backend
 from support.perception import INTRINSICS, SHAPE, box_of
 
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.perception import Detections, Perception
-from deworldsg_ros.perception.protocols import MaskPatch
+from deworldsg_ros.perception import Perception
 from deworldsg_ros.perception.stage import Uprighter, turned, turned_back
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
@@ -34,7 +34,6 @@ def turn(axis, angle_deg):
 
 
 def pitched(angle_deg):
-    """LEVEL, looking down by an angle."""
     return LEVEL @ turn("x", -angle_deg)
 
 
@@ -109,27 +108,9 @@ def test_upright_frames_stay_the_same_object():
         assert uprighter.turn(frame(turn("y", yaw_deg))).turns == 0
 
 
-class Corner:
-    """Detects one object at the top left of the image that it gets."""
-
-    classes = ("cup",)
-    predicates = ("on",)
-    default_score_threshold = 0.5
-
-    def __init__(self):
-        self.shapes = []
-
-    def detect(self, rgb, score_threshold):
-        self.shapes.append(rgb.shape[:2])
-        return Detections(np.array([[2.0, 3.0, 10.0, 12.0]]), np.ones((1, 1)), np.ones(1))
-
-    def segment(self, rgb, depth_m, intrinsics, boxes_xyxy):
-        return [MaskPatch(3, 2, np.ones((9, 8), bool)) for _ in boxes_xyxy]
-
-
 @pytest.mark.parametrize("refined", [True, False])
 def test_perception_sees_the_upright_image_unless_it_is_the_papers(refined):
-    backend = Corner()
+    backend = Backend()
     config = PerceptionConfig(refine_detections=refined, max_relations=0)
     perception = Perception(backend, backend, backend, config)
     camera = turned(frame(), 1)  # 90 degrees counter-clockwise
@@ -141,7 +122,7 @@ def test_perception_sees_the_upright_image_unless_it_is_the_papers(refined):
     assert perceived.turns == (3 if refined else 0)
     if refined:
         # The top left of the upright image is the bottom left of the camera's.
-        np.testing.assert_array_equal(graph.boxes_xyxy, [[3.0, height - 11.0, 12.0, height - 3.0]])
-        assert box_of(perceived.instances > 0).tolist() == [3, height - 10, 11, height - 3]
+        np.testing.assert_array_equal(graph.boxes_xyxy[0], [10, height - 41, 35, height - 11])
+        assert box_of(perceived.instances == 1).tolist() == [0, height - 6, 2, height - 3]
         again = perception.perceive(replace(camera, stamp_ns=1))
         np.testing.assert_array_equal(again.instances, perceived.instances)

@@ -10,15 +10,13 @@ import cv2
 import lz4.frame
 import numpy as np
 import pytest
-from support.images import SCAN, many_scans
+from support.recordings import SCAN, many_scans
 
 from deworldsg_ros.base.files import parse_any_json, parse_yaml, read_regular
 from deworldsg_ros.base.words import stamp_ns_from_text
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.evaluation.predictions import load_pickle, read_predictions
-from deworldsg_ros.poses.trajectory import FRAME_NAME
 from deworldsg_ros.recordings.bags.storage import MAX_CHUNK_BYTES, bound_decompression, decompress
-from deworldsg_ros.recordings.folders.frame_files import COLOR_NAME
 from deworldsg_ros.scene.errors import ConfigurationError, EvaluationError
 from deworldsg_ros.streams.images import decode, encoded_size
 
@@ -54,15 +52,6 @@ def test_json_and_stamps_have_one_error(reader, text):
 def test_options_are_finite_numbers(value):
     with pytest.raises(ConfigurationError, match="--set"):
         effective_config(None, [f"inputs.max_depth_m={value}"])
-
-
-@pytest.mark.parametrize(
-    ("pattern", "name"),
-    [(COLOR_NAME, "frame-000001.color.jpg"), (FRAME_NAME, "frame-000001.pose.txt")],
-)
-def test_a_line_feed_ends_no_file_name(pattern, name):
-    assert pattern.match(name)
-    assert not pattern.match(f"{name}\n")
 
 
 def test_the_size_of_an_image_is_known_before_it_is_decoded():

@@ -15,13 +15,8 @@ def test_pace_scales_recorded_time_and_rate_zero_is_always_due(rate, due_s):
     pace = Pace(rate)
     assert pace.due_s(7 * 10**18, 10.0) == 10.0
     assert pace.due_s(7 * 10**18 + 2 * 10**9, 10.1) == pytest.approx(due_s)
-
-
-def test_after_a_pause_the_replay_keeps_its_rate():
-    pace = Pace(1.0)
-    pace.due_s(0, 100.0)
-    pace.late(30.0)
-    assert pace.due_s(10**9, 130.0) == pytest.approx(131.0)
+    pace.late(30.0)  # after a pause it keeps its rate
+    assert pace.due_s(7 * 10**18 + 2 * 10**9, 40.1) == pytest.approx(due_s + 30.0)
 
 
 def window(size: int, published: int, needs: tuple[Role, ...] = ()) -> Window:

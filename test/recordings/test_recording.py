@@ -10,18 +10,18 @@ from support.recordings import (
     WORLD,
     camera_items,
     depth_mm,
+    frames_of,
     odometry,
     pose,
     rgb_pixels,
     stamp_ns,
-    transform,
+    tf,
     write_bag,
 )
 
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.recordings import source as ros
 from deworldsg_ros.recordings.bags.topics import TopicChoice
-from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.recording import open_recording, open_source
 from deworldsg_ros.recordings.source import Role
 from deworldsg_ros.recordings.writer import write_mcap
@@ -29,11 +29,6 @@ from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.errors import RecordingError
 
 COUNT = 6
-
-
-def frames_of(path, **options):
-    with closing(open_recording(path, **options)) as recording:
-        return list(recording.frames()), recording
 
 
 def assert_whole(frames, count=COUNT):
@@ -62,12 +57,12 @@ def test_frames_equal_the_recorded_messages(tmp_path, storage, compressed):
 def test_given_intrinsics_replace_those_of_a_bag(tmp_path, compressed, has_info):
     items = camera_items(COUNT, compressed=compressed)
     kept = [item for item in items if has_info or "camera_info" not in item[0]]
-    options = DatasetOptions(intrinsics=(50.0, 51.0, 3.0, 4.0))
-    frames, recording = frames_of(write_bag(tmp_path / "bag", kept), options=options)
+    given = (50.0, 51.0, 3.0, 4.0)
+    frames, recording = frames_of(write_bag(tmp_path / "bag", kept), intrinsics=given)
     assert len(frames) == COUNT
     assert not recording.drops
     size = INTRINSICS.width, INTRINSICS.height
-    assert {frame.intrinsics for frame in frames} == {Intrinsics(50.0, 51.0, 3.0, 4.0, *size)}
+    assert {frame.intrinsics for frame in frames} == {Intrinsics(*given, *size)}
 
 
 @pytest.mark.parametrize("compressed", [True, False])
@@ -87,22 +82,21 @@ def tf_items():
     """/tf of a base that carries the camera, /tf_static of the camera on it; late in the bag."""
     bases = [pose(i) @ invert_pose(T_BASE_CAMERA) for i in range(COUNT)]
     times_ns = [stamp_ns(i) for i in range(COUNT)]
-    static = transform(0, "base", CAMERA, T_BASE_CAMERA)
+    static = tf(0, ("base", CAMERA, T_BASE_CAMERA))
     return [
-        *(
-            ("/tf", ros.TF_MESSAGE, t, transform(t, WORLD, "base", T))
-            for t, T in zip(times_ns, bases)
-        ),
+        *(("/tf", ros.TF_MESSAGE, t, tf(t, (WORLD, "base", T))) for t, T in zip(times_ns, bases)),
         ("/tf_static", ros.TF_MESSAGE, max(times_ns), static),
     ]
 
 
-def odometry_items(*child):
-    return [("/odom", ros.ODOMETRY, stamp_ns(i), odometry(i, *child)) for i in range(COUNT)]
+def odometry_items(child=CAMERA, T_camera_child=np.eye(4)):
+    return [
+        ("/odom", ros.ODOMETRY, stamp_ns(i), odometry(stamp_ns(i), pose(i) @ T_camera_child, child))
+        for i in range(COUNT)
+    ]
 
 
 def robot_items():
-    """A camera on a base, and the odometry of the base."""
     items = camera_items(COUNT, with_pose=False) + tf_items()
     return in_time(items + odometry_items("base", invert_pose(T_BASE_CAMERA)))
 
@@ -117,7 +111,6 @@ def raw_messages(path):
 
 
 def replayed_poses(path):
-    """Types of the poses that a replay publishes."""
     return {item.msgtype for item in raw_messages(path) if item.role is Role.POSE}
 
 
@@ -161,7 +154,7 @@ def test_the_configuration_decides_between_poses_odometry_and_tf(tmp_path, pose_
 
 def test_tf_that_does_not_connect_the_camera_drops_frames_with_a_reason(tmp_path):
     elsewhere = [
-        ("/tf", ros.TF_MESSAGE, stamp_ns(i), transform(stamp_ns(i), WORLD, "arm", np.eye(4)))
+        ("/tf", ros.TF_MESSAGE, stamp_ns(i), tf(stamp_ns(i), (WORLD, "arm", np.eye(4))))
         for i in range(COUNT)
     ]
     items = in_time(camera_items(COUNT, with_pose=False) + elsewhere)

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.relations import (
     VOCABULARY,
@@ -159,7 +159,6 @@ def test_the_order_of_clips(uncertain, observed, expected):
     assert [tuple((item.pairs[0] + 1).tolist()) for item in stage.drain()] == expected
 
 
-@settings(max_examples=25)
 @given(
     st.lists(st.tuples(st.integers(1, 2 * SECOND_NS), st.integers(0, 6)), max_size=12),
     st.sampled_from([0.3, 1.0, 2.5, 10.0]),
@@ -204,18 +203,24 @@ def shown_stamps(model):
 
 @pytest.mark.parametrize("options", [{}, {"max_clips_per_s": 0.0}])
 @pytest.mark.parametrize(
-    ("make", "alone", "expected"),
+    ("make", "alone", "unknown", "expected"),
     [
-        (ValidIntervalModel, {2}, [3, 4, 4, 4]),
-        (ValidIntervalModel, set(), [1, 2, 3, 4]),
-        (RecordingModel, {2}, [1, 2, 3, 4]),
-        (ValidIntervalModel, None, [1, 2, 3, 4]),  # without a graph every frame is valid
+        (ValidIntervalModel, {2}, (), [3, 4, 4, 4]),
+        (ValidIntervalModel, set(), (), [1, 2, 3, 4]),
+        (RecordingModel, {2}, (), [1, 2, 3, 4]),
+        # A frame that the graph does not know is as the one before it.
+        (ValidIntervalModel, {1}, {2}, [3, 4, 4, 4]),
+        (ValidIntervalModel, set(), {2}, [1, 2, 3, 4]),
+        (ValidIntervalModel, None, (), [1, 2, 3, 4]),  # without a graph every frame is valid
     ],
 )
-def test_a_clip_of_the_valid_interval_begins_after_the_last_gap(make, alone, expected, options):
+def test_a_clip_of_the_valid_interval_begins_after_the_last_gap(
+    make, alone, unknown, expected, options
+):
     """A probe's card says which frames its clips have; the graph knows what a frame shows."""
     model, graph = make(), of_pair()
-    graph.nodes_of_frame = lambda stamp_ns: [1] if stamp_ns in alone else [1, 2]
+    nodes = {**dict.fromkeys(range(1, 5), [1, 2]), **dict.fromkeys(alone or (), [1])}
+    graph.nodes_of_frame = {**nodes, **dict.fromkeys(unknown)}.get
     if alone is None:
         stage = RelationReasoner(config(**options), model, report=lambda _: None)
     else:

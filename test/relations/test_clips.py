@@ -17,9 +17,7 @@ from deworldsg_ros.relations.clips import (
     QueuedClip,
     Rank,
     crop_clip,
-    interval_start,
     union_box,
-    without_first,
 )
 
 # --- frames --------------------------------------------------------------------------------------
@@ -94,30 +92,6 @@ def test_a_clip_is_the_crop_of_each_frame_and_the_last_one_fills_it(count):
             crop_clip([picture(0)] * wrong, (0, 0, 9, 9), 5)
 
 
-@pytest.mark.parametrize(
-    "seen, start",
-    [
-        ([True], 0),
-        ([None], 0),
-        ([True, True, True], 0),
-        ([True, False, True], 2),
-        ([True, False, True, True], 2),
-        ([False, None, True], 2),  # nothing is known of the frame before
-        ([False, True, None, True], 1),
-        ([None, None, True], 2),
-        ([True, None, None, None], 0),
-    ],
-)
-def test_the_valid_interval_is_the_last_one_in_which_both_objects_are_seen(seen, start):
-    assert interval_start(seen) == start
-
-
-@pytest.mark.parametrize("count, frames", [(0, [0, 1, 2]), (1, [1, 2, 2]), (2, [2, 2, 2])])
-def test_first_frames_are_left_out_and_the_last_one_fills(count, frames):
-    clip = np.arange(3, dtype=np.uint8).reshape(3, 1, 1, 1) * np.ones((3, 2, 2, 3), np.uint8)
-    assert without_first(clip, count)[:, 0, 0, 0].tolist() == frames
-
-
 # --- the queue -----------------------------------------------------------------------------------
 
 
@@ -163,33 +137,12 @@ def test_keeps_the_best_in_order_and_counts_the_rest(items, size):
     assert dropped["queue_full"] == len(best[size:]) == dropped.total()
 
 
-def test_order_does_not_depend_on_the_order_of_arrival():
-    items = [queued(1, rows=(i, j)) for i in range(4) for j in range(i + 1, 4)]
-    for arrival in (items, items[::-1]):
-        queue, _ = queue_of()
-        queue.put(arrival)
-        assert [item.rows for item in taken(queue)] == [item.rows for item in items]
-
-
 def test_only_the_newest_clip_of_a_pair_waits():
     queue, dropped = queue_of(policy=ByPair)
     queue.put([queued(1), queued(2), queued(1, rows=(0, 2))])
     queue.put([queued(3, rows=(0, 2))])
     assert [(item.stamp_ns, item.rows) for item in taken(queue)] == [(3, (0, 2)), (2, (0, 1))]
     assert dropped == {"superseded": 2}
-
-
-def test_clips_of_known_pairs_are_cut_before_their_frames_leave_and_others_become_stale():
-    frames = FrameBuffer(2)
-    image = np.arange(300, dtype=np.uint8).reshape(10, 10, 3)
-    frames.add(1, image)
-    (known, lost), (unknown, stale) = queue_of(policy=ByPair), queue_of()
-    for queue in (known, unknown):
-        queue.put([queued(1)])
-        queue.cut(1, frames, 4)
-    item = known.take()
-    assert item.pixels.shape == (4, 10, 10, 3) and (item.pixels == image).all() and not lost
-    assert len(unknown) == 0 and stale == {"stale": 1}
 
 
 def test_cut_clips_have_bounded_memory_and_the_lowest_ranks_are_dropped(monkeypatch):
@@ -201,10 +154,3 @@ def test_cut_clips_have_bounded_memory_and_the_lowest_ranks_are_dropped(monkeypa
         queue.put([queued(stamp, rows=(0, stamp))])
     queue.cut(3, frames, 4)
     assert [item.stamp_ns for item in taken(queue)] == [3, 2] and dropped == {"stale": 1}
-
-
-@pytest.mark.parametrize("size", [0, -1])
-def test_a_size_below_one_is_refused(size):
-    for make in (queue_of, FrameBuffer):
-        with pytest.raises(ValueError, match=f"of {'size ' * (make is queue_of)}{size}"):
-            make(size)

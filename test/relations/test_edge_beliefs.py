@@ -8,17 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.merging import set_confirmed
-from support.room_nodes import (
-    VOCABULARY,
-    Thing,
-    bowl,
-    chair,
-    plant,
-    room,
-    table,
-    thing,
-    vote,
-)
+from support.room_nodes import DESK, DINNER, VOCABULARY, Thing, chair, room, table, thing, vote
 from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 
 from deworldsg_ros.config import Config, OutputConfig, PerceptionConfig, RelationsConfig
@@ -43,14 +33,6 @@ from deworldsg_ros.wire.follow import GraphReplica
 seeds = st.integers(0, 10_000)
 PREDICATES = VOCABULARY.predicates
 WIDTH = len(PREDICATES)
-DESK = {"table": table(0, 0), "cup": thing("cup", 0.3, 0.1, 0.74, 0.09, 0.09, 0.1)}
-DINNER = {
-    **DESK,
-    "chair": chair(0, 0.5),
-    "bowl": bowl(-0.2, 0, 0.74),
-    "plant": plant(-0.6, 0.2, 0.74),
-    "fridge": thing("refrigerator", 1.3, 0, 0, 0.6, 0.6, 1.7),
-}
 
 
 def config(head: str = "geometric", **relations: object) -> Config:
@@ -183,17 +165,6 @@ def test_votes_of_another_relation_head_count_more() -> None:
     assert of("egtr") > of("geometric")
 
 
-def test_without_a_world_model_surfaces_do_not_matter() -> None:
-    def told(things: dict[str, Thing]) -> list[wire.EdgeState]:
-        builder, pair = desk(things, world_model="none")
-        vote(builder, *pair, "on", 12)
-        vote(builder, *pair, None, 8)
-        return builder.full().edges
-
-    elsewhere = {**DESK, "cup": thing("cup", 0.3, 2.1, 0.1, 0.09, 0.09, 0.1)}
-    assert told(DESK) == told(elsewhere) and len(told(DESK)) == 1
-
-
 def test_unconfirmed_nodes_have_no_edges_and_take_no_part() -> None:
     """A phantom under the cup would otherwise carry half of it."""
     phantom = {**DESK, "phantom": thing("book", 0.3, 0.1, 0.71, 0.3, 0.3, 0.03)}
@@ -281,7 +252,6 @@ def test_both_directions_of_two_objects_of_one_class_may_be_open_again_and_again
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")  # of pairs that are surely not related
-@settings(max_examples=30, deadline=None)
 @given(seed=seeds, count=st.sampled_from([0, 6]), alpha=st.sampled_from([0.0, 0.5, 10.0]))
 def test_the_prior_keeps_the_probability_that_a_pair_is_related(seed, count, alpha) -> None:
     rng = np.random.default_rng(seed)
@@ -367,18 +337,6 @@ def cups_on_a_table() -> tuple[GraphBuilder, dict[str, int]]:
     return room({"table": table(0.4, 0.4, 1.2, 1.2), **cups}, config())
 
 
-def test_messages_that_did_not_change_are_the_same_objects() -> None:
-    far = {"far table": table(4, 0), "far cup": thing("cup", 4.3, 0.1, 0.74, 0.09, 0.09, 0.1)}
-    builder, ids = room({**DESK, **far}, config())
-    before = edges_of(builder)
-    assert all(one is edges_of(builder)[pair] for pair, one in before.items())
-    vote(builder, ids["cup"], ids["table"], "on", 3)
-    after = edges_of(builder)
-    one, other = (ids["cup"], ids["table"]), (ids["far cup"], ids["far table"])
-    assert after[one] is not before[one] and after[one] != before[one]
-    assert after[other] is before[other]
-
-
 def test_a_large_graph_is_prepared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first update has all of it, as if it had been prepared at once."""
     at_once = cups_on_a_table()[0].update()
@@ -411,6 +369,8 @@ def test_many_changes_are_told_in_several_updates() -> None:
         updates += 1
         if update is not None:
             replica.apply(update)
+        if updates == 1:
+            builder.graph.remove_node(node_id)  # it does not wait any more
     assert 2 <= updates <= 10
     whole = builder.full()
     assert list(replica.nodes.values()) == [

@@ -3,7 +3,6 @@
 import itertools
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import expit, logit, softmax
@@ -63,30 +62,6 @@ def scene_of(pairs: np.ndarray, count: int) -> rules.Scene:
 # --- one support an object -----------------------------------------------------------------------
 
 
-def supports_of(states: np.ndarray, pairs: np.ndarray, item: int) -> dict[int, float]:
-    """Probability of each support of an object."""
-    found = {}
-    for (first, second), row in zip(pairs.tolist(), states):
-        if item in (first, second):
-            carried = rules.CARRIED_FIRST if item == first else rules.CARRIED_SECOND
-            found[second if item == first else first] = float(row[carried].sum())
-    return found
-
-
-def one_at_most(probabilities: list[float]) -> list[float]:
-    """Independent events, given that one at most holds: the probability of each."""
-    weights = {}
-    for outcome in itertools.product((False, True), repeat=len(probabilities)):
-        if sum(outcome) <= 1:
-            factors = [p if holds else 1 - p for p, holds in zip(probabilities, outcome)]
-            weights[outcome] = np.prod(factors)
-    whole = sum(weights.values())
-    return [
-        sum(weight for outcome, weight in weights.items() if outcome[row]) / whole
-        for row in range(len(probabilities))
-    ]
-
-
 @settings(max_examples=60, deadline=None)
 @given(
     seed=seeds,
@@ -113,126 +88,6 @@ def test_the_kernel_equals_the_reference(
         shares = states[:, group] / states[:, group].sum(axis=1, keepdims=True)
         total = after[:, group].sum(axis=1, keepdims=True)
         np.testing.assert_allclose(after[:, group], shares * total, atol=1e-6)
-
-
-@settings(max_examples=30, deadline=None)
-@given(seed=seeds, count=st.integers(2, 5))
-def test_the_supports_of_an_object_are_events_of_which_one_at_most_holds(
-    seed: int, count: int
-) -> None:
-    """With weak supports, no circle and no pair is cut, so that the enumeration is exact."""
-    states, pairs, floor_odds = room(seed, count, scale=1.0)
-    states[:, ~REST] *= 0.5
-    states /= states.sum(axis=1, keepdims=True)
-    after, _, on_floor = rules.one_support(states, pairs, floor_odds)
-    for item in range(count):
-        before = supports_of(states, pairs, item)
-        floor = floor_odds[item] / (1 + floor_odds[item])
-        expected = one_at_most([*before.values(), floor])
-        assert on_floor[item] == pytest.approx(expected[-1])
-        found = supports_of(after, pairs, item)
-        assert list(found.values()) == pytest.approx(expected[:-1], abs=1e-6)
-
-
-# --- near ----------------------------------------------------------------------------------------
-
-ON_ONE_TABLE = {(0, 2): 1.0, (1, 2): 1.0}
-# A definition that does not hold has this probability at most.
-LEAST = 1.0 - rules.NEAR_CERTAINTY + 1e-6
-
-
-def near(
-    gaps: dict[tuple[int, int], float],
-    count: int,
-    *,
-    floor: float | list[float] = 1e9,
-    carried: dict[tuple[int, int], float] | None = None,
-    steps: float = 0.0,
-    centres: dict[tuple[int, int], float] | None = None,
-    unrelated: float = 1.0,
-    seats: tuple[tuple[int, int], ...] = (),
-) -> dict[tuple[int, int], float]:
-    """Near by pair; `carried` are probabilities that the first object rests on the second one."""
-    carried = {} if carried is None else carried
-    pairs = sorted({*gaps, *((min(pair), max(pair)) for pair in carried)})
-    scene = scene_of(np.array(pairs, np.int64).reshape(-1, 2), count)
-    scene.shapes["floor_odds"] = floor
-    beliefs = scene.beliefs
-    beliefs["live"] = True
-    for row, pair in enumerate(pairs):
-        on = [min(carried.get(ends, 0.0), rules.MOST) for ends in (pair, pair[::-1])]
-        beliefs["carried"][row] = on
-        beliefs["states"][row, 1:3] = on
-        beliefs["states"][row, 0] = unrelated * (1.0 - sum(on))
-        beliefs["states"][row, 7] = (1.0 - unrelated) * (1.0 - sum(on))  # against
-        beliefs["gap_m"][row] = gaps.get(pair, np.inf)
-        beliefs["bottom_step_m"][row] = steps
-        beliefs["centre_step_m"][row] = (centres or {}).get(pair, 0.0)
-        beliefs["with_"][row, 0] = pair in seats
-    rules.settle(scene, np.arange(count))
-    found = beliefs["relations"][:, :, NEAR]
-    np.testing.assert_array_equal(found[:, 0], found[:, 1])
-    return dict(zip(pairs, found[:, 0].tolist()))
-
-
-@pytest.mark.parametrize(
-    ("gap_m", "step_m", "on_one_table", "expected"),
-    [
-        (0.0, 0.0, False, 1.0),
-        (rules.NEAR_FLOOR_M, 0.0, False, 0.5),
-        (0.8, 0.0, False, 0.0),
-        (np.inf, 0.0, False, 0.0),
-        (0.0, 0.0, True, 1.0),
-        (rules.NEAR_SUPPORT_M, 0.0, True, 0.5),
-        (0.2, 0.0, True, 0.0),
-        # Books on two shelves of one bookcase are not near.
-        (0.0, -rules.NEAR_LEVEL_M, True, 0.5),
-        (0.0, rules.NEAR_LEVEL_M, True, 0.5),
-        (0.0, 3 * rules.NEAR_LEVEL_M, True, 0.0),
-    ],
-)
-def test_near_on_the_floor_and_on_one_support(gap_m, step_m, on_one_table, expected) -> None:
-    more = {"floor": 0.0, "carried": ON_ONE_TABLE} if on_one_table else {}
-    found = near({(0, 1): gap_m}, 3, steps=step_m, **more)
-    assert found[0, 1] == pytest.approx(rules.NEAR_CERTAINTY * expected, abs=0.035)
-
-
-def test_near_are_the_two_nearest_neighbours() -> None:
-    """Object 0 amid three others; each of them has only 0."""
-    found = near({(0, 1): 0.1, (0, 2): 0.2, (0, 3): 0.3}, 4)
-    assert found[0, 1] > 0.9 and found[0, 2] > 0.9 and found[0, 3] < LEAST
-    # It counts from both ends: 3 would be the nearest one of 0, and has two nearer ones.
-    crowd = near({(0, 3): 0.2, (1, 3): 0.1, (2, 3): 0.15}, 4)
-    assert crowd[0, 3] < LEAST and crowd[1, 3] > 0.9 and crowd[2, 3] > 0.9
-
-
-def test_of_objects_that_touch_those_with_the_nearest_centres_are_near() -> None:
-    """A row of five books: the bounds of each one overlap with those of all others."""
-    gaps = {(a, b): 0.0 for b in range(5) for a in range(b)}
-    on_shelf = {(book, 5): 1.0 for book in range(5)}
-    centres = {(a, b): 0.03 * (b - a) for a, b in gaps}
-    found = near(gaps, 6, floor=0.0, carried=on_shelf, centres=centres)
-    likely = {pair for pair, p in found.items() if p > 0.5}
-    assert likely >= {(0, 1), (1, 2), (2, 3), (3, 4)}
-    assert not likely & {(0, 3), (0, 4), (1, 4)}
-
-
-def test_pairs_that_are_not_near_or_otherwise_related_are_no_neighbours() -> None:
-    """Two objects on the table are nearer than the third one, but on it, not beside it."""
-    carried = {(1, 0): 1.0, (2, 0): 1.0}
-    gaps = {(0, 1): 0.0, (0, 2): 0.0, (0, 3): 0.3}
-    assert near(gaps, 4, carried=carried, floor=[1e9, 0.0, 0.0, 1e9])[0, 3] > 0.9
-    # However many other pairs there are, a more specific relation is not near.
-    others = {(2, 3 + other): 0.1 for other in range(3)}
-    assert near({(0, 1): 0.1} | others, 6, unrelated=0.2)[0, 1] < LEAST
-
-
-def test_a_seat_is_with_its_table_whatever_else_is_near() -> None:
-    gaps = {(0, 1): 0.05, (0, 2): 0.05, (0, 3): 0.2, (0, 4): 0.2}
-    found = near(gaps, 5, seats=((0, 3), (0, 4)))
-    assert min(found.values()) > 0.9
-    far = near({(0, 1): rules.SEAT_GAP_M + 0.2}, 2, seats=((0, 1),))
-    assert far[0, 1] < 0.05 < near({(0, 1): rules.SEAT_GAP_M}, 2, seats=((0, 1),))[0, 1]
 
 
 # --- all rules, around what changed --------------------------------------------------------------

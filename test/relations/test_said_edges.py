@@ -177,6 +177,17 @@ def test_without_a_world_model_the_frames_alone_count(case: Case) -> None:
     check(case._replace(wrong=[]), said(builder, ids))
 
 
+def test_near_are_the_next_ones_of_a_row() -> None:
+    """The bounds of the books overlap with those of all others."""
+    books = {f"b{i}": on_table("book", 0.05 * i - 0.3, 0, 0.05, 0.15, 0.2) for i in range(5)}
+    cup = on_table("cup", 0.5, 0, 0.1, 0.1, 0.1)
+    told = said(*room({"table": TABLE, **books, "cup": cup}))
+    near = {frozenset(edge[::2]) for edge, p in told.items() if edge[1] == "near" and p > 0.5}
+    assert near >= {frozenset((f"b{i}", f"b{i + 1}")) for i in range(4)}
+    far = (("b0", "b3"), ("b0", "b4"), ("b1", "b4"), ("b4", "cup"), ("b0", "table"))
+    assert not near & set(map(frozenset, far))
+
+
 @pytest.mark.slow
 def test_the_shipped_recording() -> None:
     """With the embedded perception; the wrong edges are those of release 0.2.0."""

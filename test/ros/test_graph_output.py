@@ -1,7 +1,5 @@
 """The graph on topics: JSON in pieces, detections, markers, and /tf."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace as Value
 
 import msgspec
@@ -34,7 +32,6 @@ IMITATED = Value(
 
 
 def boxed_and_not() -> wire.SceneGraphMessage:
-    """An object with a box, and one without."""
     box = wire.GravityBox([1.0, 2.0, 3.0], [0.4, 0.3, 0.2], [0.0, 0.0, 1.0, 0.0])
     covariance = [[0.04, 0.001, 0.0], [0.001, 0.01, 0.0], [0.0, 0.0, 0.0025]]
     node = make_node(7, "cup", (1.1, 2.0, 3.0), covariance)

@@ -1,7 +1,5 @@
 """Diagnostics: counts, levels, messages, and their way back from /diagnostics."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import pytest

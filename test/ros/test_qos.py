@@ -1,7 +1,5 @@
 """The choice of a subscription among what is published, and lost messages."""
 
-from __future__ import annotations
-
 import pytest
 from sensor_msgs.msg import CompressedImage, Image
 

@@ -1,21 +1,14 @@
-"""Threads of the nodes: their queues, the times of updates, and the one that writes the map."""
+"""Threads of the nodes: their queues, and the times of updates."""
 
-from __future__ import annotations
-
-import contextlib
 import threading
 import time
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy")
 
-from deworldsg_ros.ros import graph_keeper
-from deworldsg_ros.ros.graph_keeper import MapKeeper
 from deworldsg_ros.ros.threads import RATE_SLACK, UpdateTimes, Worker
-from deworldsg_ros.scene.errors import ConfigurationError
 
 LIMIT_S = 30.0
 
@@ -37,7 +30,6 @@ class Held:
             self.worker.submit(item)
 
     def submit_first(self):
-        """Submit an item and wait until the thread has taken it."""
         self.worker.submit(0)
         while self.worker.waiting:
             time.sleep(0.001)
@@ -159,17 +151,3 @@ def test_the_mean_rate_of_what_is_published_is_limited():
         times.changed(now_s, now_s)
         assert times.wait_s(now_s) == 0.0
         times.taken()
-
-
-def test_a_checkpoint_that_fails_does_not_end_the_thread(tmp_path, monkeypatch):
-    write = Mock(side_effect=[ConfigurationError("the disk is full"), MemoryError("odd"), None])
-    monkeypatch.setattr(graph_keeper, "copy_state", lambda builder: {})
-    monkeypatch.setattr(graph_keeper, "write_state", write)
-    node = Mock(refusing=lambda: contextlib.suppress(MemoryError))
-    keeper = MapKeeper(node, tmp_path / "map.npz", 10.0)
-    for count in (1, 2, 3):
-        keeper.checkpoint(None)
-        assert keeper._worker.wait_idle(LIMIT_S)
-        assert write.call_count == count
-    keeper.close()
-    node.drop.assert_called_once_with("map_not_written", "the disk is full")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import random_pose, seeds
 
@@ -124,7 +124,6 @@ def poses(seed: int, count: int) -> list[np.ndarray]:
     return [level_pose(up, rng.uniform(0, 6), rng.uniform(-0.6, 0.3)) for _ in range(count)]
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=seeds, before=st.integers(0, 6), after=st.integers(0, 6))
 def test_a_restored_estimator_continues_equally(seed: int, before: int, after: int) -> None:
     seen = poses(seed, before + after)

@@ -58,13 +58,6 @@ def test_it_is_bounded_and_depends_on_the_set_alone(seed: int, capacity: int, co
     assert parts.of(0) == parts.of(3) == (hashes, kept)
 
 
-def test_hashes_depend_on_values_and_axes() -> None:
-    points = np.array([[1, 2, 3], [3, 2, 1], [0, 0, 0], [1, 2, 3], [-0.0, 0, -0.0]], np.float32)
-    hashes, kept = sample_of(points, 10).of(0)
-    assert len(set(hashes)) == 3
-    assert sorted(kept) == [[0, 0, 0], [1, 2, 3], [3, 2, 1]]
-
-
 def test_the_draw_is_uniform_over_the_surface() -> None:
     grid = np.stack(np.meshgrid(np.arange(100), np.arange(100), [0]), -1).reshape(-1, 3)
     kept = sample_of(grid * 0.01, 1000).points(0)

@@ -1,8 +1,6 @@
 """Joining: the same messages give the same frames, whatever their order between the topics."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,18 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.streams import (
-    MS,
-    T0,
-    camera_info,
-    depth,
-    image,
-    odometry,
-    pose,
-    rgb,
-    tf,
-    transform,
-)
+from support.recordings import odometry, tf
+from support.streams import CAMERA, MS, T0, at, camera_info, depth, image, pose, rgb
 
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.scene.camera import RgbdFrame
@@ -124,10 +112,10 @@ def test_tf_gives_the_pose():
     inputs = InputsConfig(pose_source="tf", world_frame="map")
     assembler = filled(*complete(T0, without="pose"), inputs=inputs)
     T = np.eye(4)
-    assembler.add_transforms(tf(transform("base", "camera", T)), static=True)
+    assembler.add_transforms(tf(T0, ("base", "camera_optical", T)), static=True)
     assert assembler.pop_ready(None) == []
     T[0, 3] = 2.0
-    assembler.add_transforms(tf(transform("map", "base", T, T0)))
+    assembler.add_transforms(tf(T0, ("map", "base", T)))
     (frame,) = assembler.pop_ready(None)
     assert (frame.T_world_camera[0, 3], frame.frame_id) == (2.0, "map")
 
@@ -137,7 +125,7 @@ MOUNT = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]
 
 def on_a_robot(stamp_ns: int, x: float) -> list[Event]:
     """A frame with an odometry of base_link."""
-    return complete(stamp_ns, pose=odometry(stamp_ns, x, "base_link"))
+    return complete(stamp_ns, pose=odometry(stamp_ns, at(x), "base_link"))
 
 
 def robot() -> FrameAssembler:
@@ -150,9 +138,9 @@ def robot() -> FrameAssembler:
 def test_an_odometry_of_the_robot_is_transformed_to_its_camera():
     assembler = robot()
     assert assembler.pop_ready(0) == []  # how the camera is mounted is yet to come
-    assembler.add_transforms(tf(transform("base_link", "camera", MOUNT)), static=True)
+    assembler.add_transforms(tf(T0, ("base_link", "camera_optical", MOUNT)), static=True)
     # Localisation publishes its transforms ahead of time: that is no jump of the poses.
-    assembler.add_transforms(tf(transform("map", "odom", np.eye(4), T0 + 2 * SECOND)))
+    assembler.add_transforms(tf(T0 + 2 * SECOND, ("map", "odom", np.eye(4))))
     (frame,) = assembler.pop_ready(0)
     expected = MOUNT.copy()
     expected[0, 3] += 3.0
@@ -165,14 +153,14 @@ def test_an_odometry_of_the_robot_is_transformed_to_its_camera():
 
 def test_tf_does_not_replace_an_odometry_that_restarts():
     assembler = robot()
-    assembler.add_transforms(tf(transform("base_link", "camera", MOUNT)), static=True)
+    assembler.add_transforms(tf(T0, ("base_link", "camera_optical", MOUNT)), static=True)
     assert len(assembler.pop_ready(0)) == 1
     again_ns = T0 - 100 * SECOND
     for stamp_ns in (again_ns, again_ns + PERIOD):
         add(assembler, *on_a_robot(stamp_ns, float("nan")))
-        assembler.add_transforms(tf(transform("map", "base_link", np.eye(4), stamp_ns)))
+        assembler.add_transforms(tf(stamp_ns, ("map", "base_link", np.eye(4))))
     assert assembler.pop_ready(0) == []
-    assembler.add_pose(odometry(again_ns, 1.0, "base_link"), again_ns)
+    assembler.add_pose(odometry(again_ns, at(1.0), "base_link"), again_ns)
     (frame,) = assembler.pop_ready(0)
     assert frame.T_world_camera[0, 3] == pytest.approx(1.3)
 
@@ -181,7 +169,7 @@ def test_only_an_odometry_of_another_frame_needs_the_mounting():
     assembler = robot()
     assert assembler.flush() == []
     assert assembler.drops == {"no_transform": 1}
-    add(assembler, *complete(T0 + PERIOD, pose=odometry(T0 + PERIOD, 3.0, "/camera")))
+    add(assembler, *complete(T0 + PERIOD, pose=odometry(T0 + PERIOD, at(3.0), "/camera_optical")))
     (frame,) = assembler.pop_ready(0)
     assert frame.T_world_camera[0, 3] == 3.0
 
@@ -242,7 +230,7 @@ def test_streams_that_restart_one_after_the_other_lose_nothing(late):
 
 
 def test_a_changed_camera_info_is_valid_from_its_stamp_on():
-    changed = camera_info(T0 + PERIOD, (20.0, 0, 4, 0, 20.0, 3, 0, 0, 1))
+    changed = camera_info(T0 + PERIOD, replace(CAMERA, fx=20.0))
     assembler = filled(
         Event("camera_info", camera_info(T0), T0),
         Event("camera_info", changed, T0 + PERIOD),
@@ -284,17 +272,18 @@ def graph(stamp_ns: int) -> Any:
     return SimpleNamespace(stamp_ns=stamp_ns)
 
 
-def instances(stamp_ns: int) -> Any:
-    return image(np.zeros((6, 8), np.uint16), "mono16", stamp_ns)
-
-
 @given(st.permutations([0] * 3 + [1] * 3 + [2] * 3 + [3] * 3 + [4]))
 def test_lifting_frames_do_not_depend_on_interleaving(order):
-    assembler = LiftingAssembler(INPUTS)
+    assembler, nothing = LiftingAssembler(INPUTS), np.zeros((6, 8), np.uint16)
     stamps = [T0 + step * PERIOD for step in range(3)]
     streams = [
         iter([lambda at=at: assembler.add_frame_graph(graph(at)) for at in stamps]),
-        iter([lambda at=at: assembler.add_instances(instances(at), at) for at in stamps]),
+        iter(
+            [
+                lambda at=at: assembler.add_instances(image(nothing, "mono16", at), at)
+                for at in stamps
+            ]
+        ),
         iter([lambda at=at: assembler.add_depth(depth(at), at) for at in stamps]),
         iter([lambda at=at: assembler.add_pose(pose(at, (at - T0) * 1e-7), at) for at in stamps]),
         iter([lambda: assembler.add_camera_info(camera_info(), T0)]),

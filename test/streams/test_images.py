@@ -1,7 +1,5 @@
 """Images: every layout there and back, every refusal with its reason."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import cv2
@@ -10,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from sensor_msgs.msg import Image
-from support.streams import compressed, compressed_depth, image, png
+from support.recordings import encoded as png
+from support.streams import compressed, compressed_depth, image
 
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.images import (

@@ -1,7 +1,5 @@
 """Poses, their interpolation, the gate against jumps, and the TF tree."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 
@@ -9,9 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.streams import MS, T0, tf, transform
+from support.recordings import tf
+from support.streams import MS, T0, at
 
-from deworldsg_ros.scene.camera import invert_pose, pose_from_quaternion
+from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import (
     MAX_FRAMES,
@@ -22,12 +21,6 @@ from deworldsg_ros.streams.poses import (
 
 SLOP = 100 * MS
 SECOND = 10**9
-
-
-def at(x: float, y: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
-    """A pose at (x, y, 0), rotated about z."""
-    quat = np.array([0, 0, math.sin(turn_rad / 2), math.cos(turn_rad / 2)])
-    return pose_from_quaternion(np.array([x, y, 0.0]), quat)
 
 
 @contextlib.contextmanager
@@ -120,7 +113,7 @@ def add(tree: TransformTree, stamp_ns: int, pairs: str, T: np.ndarray | None = N
     """Add transforms, named "parent child, parent child"."""
     T = at(1.0) if T is None else T
     named = (pair.split() for pair in pairs.split(","))
-    tree.add(tf(*(transform(*names, T, stamp_ns) for names in named)), static=static)
+    tree.add(tf(stamp_ns, *((*names, T) for names in named)), static=static)
 
 
 def test_tf_chains_static_and_moving_transforms():

@@ -4,8 +4,6 @@ Software rendering takes seconds a frame on a busy machine. So `Screen` looks ag
 expected is there.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import shutil
@@ -54,7 +52,6 @@ def chromium() -> str:
 
 @contextmanager
 def browser() -> Iterator[Any]:
-    """A browser of playwright, closed at the end."""
     api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
     path = chromium()
     with api.sync_playwright() as playwright:
@@ -86,25 +83,17 @@ def opened_page(
 
 
 def pixels_of(shot: bytes) -> np.ndarray:
-    """A screenshot as (H, W, 3)."""
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
 
 class Screen:
-    """The page of the live viewer.
-
-    Args:
-        page: of playwright.
-        viewer: the viewer.
-        labels: the classes of its graph.
-    """
+    """The page of a live viewer, whose graph has the classes `labels`."""
 
     def __init__(self, page: Any, viewer: Any, labels: list[str]) -> None:
         self.page, self.viewer = page, viewer
         self._colours = class_colours(labels)
 
     def until(self, holds: Callable[[], bool], what: str) -> None:
-        """Wait until a condition holds."""
         end_s = time.monotonic() + LIMIT_S
         while not holds():
             assert time.monotonic() < end_s, what
@@ -117,7 +106,6 @@ class Screen:
 
     @property
     def camera(self) -> Any:
-        """The camera of the one browser."""
         from deworldsg_ros.view.live.scene import camera_of
 
         (client,) = self.viewer._server.get_clients().values()
@@ -132,16 +120,13 @@ class Screen:
         self.until(lambda: set(filter(self._shows, self._colours)) == set(labels), f"only {labels}")
 
     def says(self, text: str) -> None:
-        """Wait until the panel has a text."""
         self.page.get_by_text(text).first.wait_for()
 
     def open(self, *folders: str) -> None:
-        """Open folders of the panel."""
         for folder in folders:
             self.page.get_by_text(folder, exact=True).first.click()
 
     def click_at(self, point: Any) -> None:
-        """Click a point (3,) of the world."""
         (place,), _ = self.camera.project(np.array([point], float))
         self.page.mouse.click(*place.tolist())
 

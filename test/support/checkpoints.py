@@ -1,7 +1,5 @@
 """Small checkpoints of world models and probes: real architectures and file formats."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -34,7 +32,6 @@ def save_vjepa2(folder, seed=0, **changes):
 
 
 def save_dinov2(folder, seed=0, **changes):
-    """Save a DINOv2 with 48 features and 56 pixels and return its folder."""
     torch.manual_seed(seed)
     config = transformers.Dinov2Config(**{**SMALL, "image_size": 56, **changes})
     transformers.Dinov2Model(config).save_pretrained(folder)
@@ -42,13 +39,11 @@ def save_dinov2(folder, seed=0, **changes):
 
 
 def config_of(family, folder, **changes):
-    """Options of the relations stage with this checkpoint."""
     settings = {"clip_length": CLIP_LENGTH, "world_model_path": str(folder)}
     return RelationsConfig(world_model=family, **{**settings, **changes})
 
 
 def save_random_probe(folder, backbone: BackboneIdentity, **changes):
-    """Save an untrained probe and return its folder."""
     torch.manual_seed(1)
     card = ProbeCard(backbone, VOCABULARY.predicates, **changes)
     probe = Probe(card, build_network(card).eval())
@@ -57,13 +52,11 @@ def save_random_probe(folder, backbone: BackboneIdentity, **changes):
 
 
 def clip(seed=0, height=40, width=50, length=CLIP_LENGTH):
-    """Random frames (length, height, width, 3) uint8."""
     generator = np.random.default_rng(seed)
     return generator.integers(0, 256, (length, height, width, 3)).astype(np.uint8)
 
 
 def request(seed=0, **shape):
-    """A request for both directions of one pair."""
     names = VOCABULARY.classes
     boxes = np.array([0.0, 0, 20, 30]), np.array([10.0, 5, 50, 40])
     pairs = tuple(

@@ -1,7 +1,5 @@
 """Runs commands: in a process of their own, as a user does, or in this one."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -42,7 +40,6 @@ def deworldsg(
 
 
 def start(folder: Path, *arguments: object) -> subprocess.Popen[str]:
-    """Start a command in `folder`."""
     return subprocess.Popen(
         [*COMMAND, *map(str, arguments)],
         cwd=folder,
@@ -54,7 +51,6 @@ def start(folder: Path, *arguments: object) -> subprocess.Popen[str]:
 
 
 def invoke(*words: object) -> Result:
-    """Run a command in this process."""
     return CliRunner().invoke(app, [str(word) for word in words])
 
 

@@ -1,10 +1,8 @@
 """Exact RGB-D frames of the corner of a room: two textured walls and a floor."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, rigid_motion
 
 INTRINSICS = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
 # A level camera that points along +x. The walls are in front and to the left, the floor below.
@@ -16,16 +14,8 @@ WALLS = ((0, 3.0), (1, 0.8), (2, -0.4))
 
 
 def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:
-    """The exact frame at a camera pose."""
     v, u = np.mgrid[: INTRINSICS.height, : INTRINSICS.width]
-    rays = np.stack(
-        [
-            (u - INTRINSICS.cx) / INTRINSICS.fx,
-            (v - INTRINSICS.cy) / INTRINSICS.fy,
-            np.ones(u.shape),
-        ],
-        axis=-1,
-    )
+    rays = INTRINSICS.back_project(u, v, np.ones(u.shape))
     directions = rays @ T_world_camera[:3, :3].T
     depth = np.full(u.shape, np.inf)
     for axis, position_m in WALLS:
@@ -47,10 +37,7 @@ def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:
 
 def camera_at(yaw_deg: float, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> np.ndarray:
     """Pose of a level camera, rotated to the left by `yaw_deg` and translated."""
-    angle = np.radians(yaw_deg)
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    T[:3, 3] = x_m, y_m, z_m
+    T = rigid_motion(np.array([x_m, y_m, z_m]), np.array([0.0, 0.0, np.radians(yaw_deg)]))
     return T @ LEVEL
 
 

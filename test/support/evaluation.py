@@ -1,13 +1,11 @@
 """Tiny data sets in the official layouts."""
 
-from __future__ import annotations
-
 import json
+import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from deworldsg_ros.evaluation.predictions import ScanPrediction
@@ -65,11 +63,7 @@ def write_dataset(
     layout: str = "replica",
     split_scans: Sequence[str] | None = None,
 ) -> Path:
-    """Write a data set and return its root.
-
-    A scan is a list of objects (label, id) and a list of relations (subject, object, predicate).
-    `surface` contains the points of an object.
-    """
+    """Write scans, each of objects (label, id) and relations (subject, object, predicate)."""
     lists, objects, relations, mapping, keys = NAMES[layout]
     labels = {name: name for name in CLASSES} | {"wall": "wall"}
     write_json(root / mapping, dict(zip(keys, (labels, CLASSES, PREDICATES))))
@@ -115,33 +109,16 @@ def one_hot(index: int) -> list[float]:
 
 
 def write_predictions(
-    path: Path,
-    predictions: Mapping[str, ScanPrediction],
-    class_count: int,
-    predicate_count: int,
+    path: Path, predictions: Mapping[str, ScanPrediction], protocol: int | None = None
 ) -> None:
-    """Write predictions in the project's open format."""
+    """Write predictions as FROSS does, in a pickle."""
     scans = {
         scan: {
-            "nodes": [
-                {"id": row, "class_probabilities": scores, "points": points.tolist()}
-                for row, (scores, points) in enumerate(
-                    zip(prediction.class_scores.tolist(), prediction.points_world)
-                )
-            ],
-            "edges": [
-                {"subject": subject, "object": object_, "predicate_probabilities": scores}
-                for (subject, object_), scores in zip(
-                    prediction.edges.tolist(), prediction.edge_scores.tolist()
-                )
-            ],
+            "pcd": list(prediction.points_world),
+            "cls": prediction.class_scores,
+            "edge_index": prediction.edges.T,
+            "edge_cls": prediction.edge_scores,
         }
         for scan, prediction in predictions.items()
     }
-    content = {
-        "format": "scene graph predictions 1",
-        "num_classes": class_count,
-        "num_predicates": predicate_count,
-        "scans": scans,
-    }
-    path.write_bytes(msgspec.json.encode(content))
+    path.write_bytes(pickle.dumps(scans, protocol))

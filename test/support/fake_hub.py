@@ -17,19 +17,13 @@ def git_blob(content: bytes) -> str:
 
 
 class FakeHub:
-    """Serves the files of one model; weights are large files with a SHA-256.
-
-    Attributes:
-        requested: method, file and range of each download.
-        damaged: names of files that are served with one wrong byte.
-        cut: names of files whose next download ends in the middle.
-    """
+    """Serves the files of one model; weights are large files with a SHA-256."""
 
     def __init__(self, repository: str, files: dict[str, bytes], licence: str = "mit") -> None:
         self.repository, self.files, self.licence = repository, files, licence
-        self.requested: list[tuple[str, str, str]] = []
-        self.damaged: set[str] = set()
-        self.cut: set[str] = set()
+        self.requested: list[tuple[str, str, str]] = []  # method, file and range
+        self.damaged: set[str] = set()  # names of files that are served with one wrong byte
+        self.cut: set[str] = set()  # names of files whose next download ends in the middle
         self.url = ""
 
     def metadata(self) -> bytes:
@@ -55,20 +49,14 @@ class FakeHub:
             def log_message(self, *arguments: object) -> None:
                 pass
 
-            def do_HEAD(self) -> None:
-                self._answer(with_body=False)
-
             def do_GET(self) -> None:
-                self._answer(with_body=True)
-
-            def _answer(self, with_body: bool) -> None:
                 path = self.path.partition("?")[0]
                 if path == f"/api/models/{hub.repository}":
-                    return self._send(200, hub.metadata(), {}, with_body)
+                    return self._send(200, hub.metadata(), {})
                 prefix = f"/{hub.repository}/resolve/{COMMIT}/"
                 name = path.removeprefix(prefix)
                 if not path.startswith(prefix) or name not in hub.files:
-                    return self._send(404, b"{}", {"X-Error-Code": "RepoNotFound"}, with_body)
+                    return self._send(404, b"{}", {"X-Error-Code": "RepoNotFound"})
                 content, asked = hub.files[name], self.headers.get("Range", "")
                 etag = hashlib.sha256(content).hexdigest()
                 hub.requested.append((self.command, name, asked))
@@ -79,22 +67,23 @@ class FakeHub:
                     first = int(asked.removeprefix("bytes=").partition("-")[0])
                     total = len(content)
                     headers["Content-Range"] = f"bytes {first}-{total - 1}/{total}"
-                    return self._send(206, content[first:], headers, with_body)
-                return self._send(200, content, headers, with_body)
+                    return self._send(206, content[first:], headers)
+                return self._send(200, content, headers)
 
-            def _send(
-                self, status: int, body: bytes, headers: dict[str, str], with_body: bool
-            ) -> None:
+            def do_HEAD(self) -> None:
+                self.do_GET()
+
+            def _send(self, status: int, body: bytes, headers: dict[str, str]) -> None:
                 self.send_response(status)
                 for key, value in {**headers, "Content-Length": str(len(body))}.items():
                     self.send_header(key, value)
                 self.end_headers()
                 name = self.path.rpartition("/")[2]
-                if with_body and name in hub.cut:
+                if self.command == "GET" and name in hub.cut:
                     hub.cut.remove(name)
                     self.wfile.write(body[: len(body) // 2])
                     self.close_connection = True
-                elif with_body:
+                elif self.command == "GET":
                     self.wfile.write(body)
 
         server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)

@@ -1,7 +1,5 @@
 """A WebSocket client of the server for Foxglove."""
 
-from __future__ import annotations
-
 import json
 import struct
 import time
@@ -21,7 +19,6 @@ class FoxgloveClient:
         self.received: dict[str, list[bytes]] = {}
 
     def expect(self, topic: str, text: bytes) -> None:
-        """Wait until a message of a topic contains a text."""
         end_s = time.monotonic() + LIMIT_S
         while text not in b"".join(self.received.get(topic, [])):
             assert time.monotonic() < end_s, (topic, text, self.received.keys())

@@ -2,25 +2,20 @@
 
 import base64
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import msgspec
 import numpy as np
+from support.merging import VOCABULARY, local_graph, random_covariances, random_pose
 
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene import limits
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import (
-    DepthGrid,
-    LocalGraph,
-    RelationEvidence,
-    Relations,
-    Vocabulary,
-)
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, RelationEvidence
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import GraphReplica
 
-VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
 PLACES_M = [0.0, 1e-9, 0.01, 0.5, 1.0, 31.0, 1e3, limits.MAX_COORDINATE_M]
 LOGITS = [0.0, 1e-300, 5.0, -5.0, 745.0, 1e4, limits.MAX_LOGIT, -limits.MAX_LOGIT]
 PROBABILITIES = [0.0, 1e-300, 1e-9, 0.2, 0.45, 0.5, 1.0 - 1e-9, 1.0]
@@ -32,13 +27,8 @@ PIXELS = [1, 2, 50, 1000, limits.MAX_SIDE_PX**2]
 
 def hostile_covariances(rng: np.random.Generator, count: int) -> np.ndarray:
     """Covariances (n, 3, 3) from the smallest to the largest, and from round to needles."""
-    bases = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
-    largest = 10.0 ** rng.uniform(-9, 8, (count, 1, 1)) * 0.99
-    ratios = 10.0 ** -rng.uniform(0, 12, (count, 1, 3)) * rng.choice([1.0, 1e-3], (count, 1, 3))
-    ratios[:, :, 0] = 1.0
-    variances = np.maximum(largest * np.maximum(ratios, 1e-12), 2e-12)
-    covariances = bases * variances @ bases.swapaxes(1, 2)
-    return np.clip(covariances + covariances.swapaxes(1, 2), -2e8, 2e8) / 2
+    scales = 10.0 ** rng.uniform(0, 8, (count, 1, 1))
+    return np.clip(random_covariances(rng, count, 1.5e-6) * scales, -2e8, 2e8)
 
 
 def hostile_distributions(rng: np.random.Generator, count: int, width: int) -> np.ndarray:
@@ -51,9 +41,7 @@ def hostile_distributions(rng: np.random.Generator, count: int, width: int) -> n
 
 def hostile_pose(rng: np.random.Generator) -> np.ndarray:
     """A rigid transform (4, 4), near the origin or far away."""
-    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    pose = np.eye(4)
-    pose[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
+    pose = random_pose(rng)
     pose[:3, 3] = rng.choice(PLACES_M, 3) * rng.choice([-1, 1], 3)
     return pose
 
@@ -75,7 +63,6 @@ def hostile_grid(rng: np.random.Generator, width: int, height: int) -> DepthGrid
 
 
 def hostile_local_graph(rng: np.random.Generator, stamp_ns: int) -> LocalGraph:
-    """A local graph of 0 to 6 objects."""
     count = int(rng.integers(0, 7))
     width, height = int(rng.choice([1, 64, 640])), int(rng.choice([1, 48, 480]))
     means = rng.choice(PLACES_M, (count, 3)) * rng.choice([-1, 1], (count, 3))
@@ -89,27 +76,28 @@ def hostile_local_graph(rng: np.random.Generator, stamp_ns: int) -> LocalGraph:
     )  # fmt: skip
     pairs = [(a, b) for a in range(count) for b in range(count) if a != b and rng.random() < 0.5]
     corners = np.sort(rng.choice([-32768, 0, 1, 9.5, 639, 32768], (count, 2, 2)), axis=1)
-    return LocalGraph(
-        stamp_ns=stamp_ns,
+    graph = local_graph(
+        stamp_ns,
+        means,
+        hostile_covariances(rng, count),
+        hostile_distributions(rng, count, 4),
+        points=points,
+        pairs=pairs,
+        logits=rng.choice(LOGITS, (len(pairs), 3)),
         frame_id="map",
+    )
+    relations = replace(graph.relations, scores=rng.choice(PROBABILITIES, len(pairs)))
+    return replace(
+        graph,
         width=width,
         height=height,
         T_world_camera=hostile_pose(rng),
-        vocabulary=VOCABULARY,
         instance_ids=rng.choice([1, 2, 3, 4, 5, 2**16 - 2, 2**16 - 1], count, replace=False),
         boxes_xyxy=corners.reshape(count, 4).astype(np.float64),
-        class_probabilities=hostile_distributions(rng, count, 4),
         scores=rng.choice(PROBABILITIES, count),
-        means_world=means,
-        covariances_world=hostile_covariances(rng, count),
         depths_m=np.abs(rng.choice(PLACES_M, count)),
         pixel_counts=rng.choice(PIXELS, count),
-        surface_points_world=points,
-        relations=Relations(
-            np.array(pairs, np.int64).reshape(-1, 2),
-            rng.choice(LOGITS, (len(pairs), 3)),
-            rng.choice(PROBABILITIES, len(pairs)),
-        ),
+        relations=relations,
         depth_grid=hostile_grid(rng, width, height),
     )
 
@@ -132,7 +120,6 @@ def hostile_evidence(rng: np.random.Generator, local: LocalGraph) -> RelationEvi
 
 
 def hostile_scene_graph(rng: np.random.Generator) -> wire.SceneGraphMessage:
-    """A scene graph of 0 to 8 nodes, as its schema allows it."""
     count = int(rng.integers(0, 9))
     ids = rng.choice([1, 2, 3, 4, 5, 7, 2**31, 2**53 + 1, 2**63 - 1], count, replace=False)
     pairs = [(a, b) for a in [*ids, 6] for b in [*ids, 8] if a != b and rng.random() < 0.2]
@@ -154,10 +141,8 @@ def hostile_scene_graph(rng: np.random.Generator) -> wire.SceneGraphMessage:
             }
         ],
     }
-    for name in ("up", "hidden"):
-        if rng.random() < 0.5:
-            del message[name]
-    return wire.decode(msgspec.json.encode(message), wire.SceneGraphMessage)
+    content = msgspec.json.encode(_without_some(rng, message, "up", "hidden"))
+    return wire.decode(content, wire.SceneGraphMessage)
 
 
 def _hostile_node(rng: np.random.Generator, node_id: int) -> dict[str, Any]:
@@ -193,10 +178,7 @@ def _hostile_node(rng: np.random.Generator, node_id: int) -> dict[str, Any]:
         "label_provenance": "operator",
     }
     optional = ("existence", "remainder", "entropy_nats", "box", "surface_points_m", "surface_mm")
-    for name in (*optional, "label_provenance"):
-        if rng.random() < 0.5:
-            del node[name]
-    return node
+    return _without_some(rng, node, *optional, "label_provenance")
 
 
 def _hostile_edge(rng: np.random.Generator, subject: int, object_: int) -> dict[str, Any]:
@@ -213,17 +195,15 @@ def _hostile_edge(rng: np.random.Generator, subject: int, object_: int) -> dict[
         "mutual": bool(rng.random() < 0.5),
         "shown": int(rng.choice([0, 1, 2**63 - 1])),
     }
-    for name in ("remainder", "mutual", "shown"):
-        if rng.random() < 0.5:
-            del edge[name]
-    return edge
+    return _without_some(rng, edge, "remainder", "mutual", "shown")
+
+
+def _without_some(rng: np.random.Generator, content: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {k: value for k, value in content.items() if k not in names or rng.random() < 0.5}
 
 
 def _belief(rng: np.random.Generator) -> dict[str, Any]:
-    return {
-        "label": str(rng.choice(LABELS)),
-        "probability": float(rng.choice(PROBABILITIES)),
-    }
+    return {"label": str(rng.choice(LABELS)), "probability": float(rng.choice(PROBABILITIES))}
 
 
 def _place(rng: np.random.Generator) -> list[float]:
@@ -238,14 +218,11 @@ def _unit(rng: np.random.Generator, size: int) -> list[float]:
 
 
 def _hostile_stamp(rng: np.random.Generator) -> dict[str, int]:
-    return {
-        "sec": int(rng.choice([0, 1, 2**31 - 1])),
-        "nanosec": int(rng.choice([0, 10**9 - 1])),
-    }
+    sec, nanosec = rng.choice([0, 1, 2**31 - 1]), rng.choice([0, 10**9 - 1])
+    return {"sec": int(sec), "nanosec": int(nanosec)}
 
 
 def state_of(builder: GraphBuilder) -> bytes:
-    """Everything that a graph builder knows, as bytes."""
     memory = builder.merging.memory()
     return pickle.dumps(
         (builder.graph.state(), memory, builder.prior.to_state(), builder.up.state().tobytes())

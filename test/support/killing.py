@@ -27,13 +27,11 @@ def killed(work: Callable[[], object], after_s: float) -> None:
 
 
 def moments_s(count: int, longest_s: float, seed: int = 0) -> Iterator[float]:
-    """Times at which to kill."""
     yield from np.random.default_rng(seed).uniform(0.0, longest_s, count).tolist()
 
 
 @contextmanager
 def full_disk(after_bytes: int) -> Iterator[None]:
-    """No file can become longer than this."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (after_bytes, hard))
     try:

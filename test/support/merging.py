@@ -5,7 +5,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from deworldsg_ros.graph.graph import GlobalGraph
+from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+from deworldsg_ros.wire import messages as wire
 
 VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
 
@@ -16,6 +18,16 @@ EDITS = ["add", "observe", "confirm", "merge", "remove", "visual", "neighbour", 
 def set_confirmed(graph: GlobalGraph, node_id: int, confirmed: bool) -> None:
     """Publish a node, or hide it."""
     graph.set_existence([node_id], np.array([float(confirmed)]), 0.5)
+
+
+def node_states(
+    graph: GlobalGraph, top_k: int, with_points: bool = False
+) -> dict[int, wire.NodeState]:
+    """Messages of the confirmed nodes by ascending id, as a publication makes them."""
+    states = NodeStates(graph, top_k, graph.even_gaussians)
+    states.refresh()
+    known = dict(sorted(states.states.items()))
+    return {i: states.with_points(known[i]) for i in known} if with_points else known
 
 
 def moments(points_xyz: np.ndarray, ridge_m2: float) -> tuple[np.ndarray, np.ndarray]:
@@ -56,39 +68,37 @@ def local_graph(
     means: NDArray[np.float64],
     covariances: NDArray[np.float64],
     classes: NDArray[np.float64],
+    /,
     *,
     points: tuple[NDArray[np.float32], ...] | None = None,
     pairs: list[tuple[int, int]] | None = None,
     logits: NDArray[np.float64] | None = None,
     vocabulary: Vocabulary = VOCABULARY,
-    frame_id: str = "world",
+    **changes: object,
 ) -> LocalGraph:
     """A local graph of these Gaussians and class distributions."""
-    count = len(means)
-    predicates = len(vocabulary.predicates)
+    count, predicates = len(means), len(vocabulary.predicates)
     pair_array = np.array(pairs or [], np.int64).reshape(-1, 2)
-    return LocalGraph(
-        stamp_ns=stamp_ns,
-        frame_id=frame_id,
-        width=640,
-        height=480,
-        T_world_camera=np.eye(4),
-        vocabulary=vocabulary,
-        instance_ids=np.arange(1, count + 1),
-        boxes_xyxy=np.tile([0.0, 0.0, 10.0, 10.0], (count, 1)),
-        class_probabilities=classes,
-        scores=np.full(count, 0.9),
-        means_world=means,
-        covariances_world=covariances,
-        depths_m=np.ones(count),
-        pixel_counts=np.full(count, 100),
-        surface_points_world=points or tuple(np.zeros((0, 3), np.float32) for _ in range(count)),
-        relations=Relations(
-            pair_array,
-            np.zeros((len(pair_array), predicates)) if logits is None else logits,
-            np.ones(len(pair_array)),
-        ),
-    )
+    logits = np.zeros((len(pair_array), predicates)) if logits is None else logits
+    fields = {
+        "stamp_ns": stamp_ns,
+        "frame_id": "world",
+        "width": 640,
+        "height": 480,
+        "T_world_camera": np.eye(4),
+        "vocabulary": vocabulary,
+        "instance_ids": np.arange(1, count + 1),
+        "boxes_xyxy": np.tile([10.0, 10, 100, 100], (count, 1)),
+        "class_probabilities": classes,
+        "scores": np.full(count, 0.9),
+        "means_world": means,
+        "covariances_world": covariances,
+        "depths_m": np.full(count, 2.0),
+        "pixel_counts": np.full(count, 100),
+        "surface_points_world": points or (np.zeros((0, 3), np.float32),) * count,
+        "relations": Relations(pair_array, logits, np.ones(len(pair_array))),
+    }
+    return LocalGraph(**{**fields, **changes})
 
 
 def random_local_graphs(rng: np.random.Generator, frames: int) -> list[LocalGraph]:

@@ -1,7 +1,5 @@
 """Node processes, and a camera that publishes a recording to them."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
@@ -42,7 +40,7 @@ TOPICS = {
 SUBSCRIBERS = {Role.RGB: 1, Role.DEPTH: 2, Role.CAMERA_INFO: 2, Role.POSE: 2}
 
 
-class NodeProcess:
+class NodeProcess(subprocess.Popen):
     """One node process; `with` ends it."""
 
     def __init__(
@@ -61,54 +59,37 @@ class NodeProcess:
         }
         command = [sys.executable, "-m", f"deworldsg_ros.nodes.{name}", *given, *arguments]
         with self.log_path.open("w") as log:
-            self._process = subprocess.Popen(
+            super().__init__(
                 command, env=environment, cwd=folder, stdout=log, stderr=subprocess.STDOUT
             )
-
-    def __enter__(self) -> NodeProcess:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.end()
 
     @property
     def log(self) -> str:
-        """The output of the process."""
         return self.log_path.read_text()
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs."""
-        return self._process.poll() is None
+        return self.poll() is None
 
     def wait_ready(self, limit_s: float = 150.0) -> None:
-        """Wait until the node logs that it is ready."""
         wait_until(lambda: "ready" in self.log or not self.alive, limit_s, f"{self.name} to start")
         assert self.alive, self.log
 
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
-
-    def wait(self, limit_s: float) -> int:
-        """Wait for the end of the process; returns its exit code."""
-        return self._process.wait(limit_s)
-
     def interrupt(self, limit_s: float = 20.0) -> int:
         """Send SIGINT and wait; returns the exit code."""
-        if self.alive:
-            self._process.send_signal(signal.SIGINT)
-        return self._process.wait(limit_s)
+        self.send_signal(signal.SIGINT)
+        return self.wait(limit_s)
 
     def end(self) -> None:
         """End the process with SIGINT, then SIGTERM, then SIGKILL."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-            if not self.alive:
-                return
-            self._process.send_signal(number)
+            self.send_signal(number)
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(5)
+                self.wait(5)
+                return
 
 
 def run_to_end(name: str, folder: Path, *arguments: str, **options: Any) -> tuple[int, str]:
@@ -117,12 +98,17 @@ def run_to_end(name: str, folder: Path, *arguments: str, **options: Any) -> tupl
         return node.wait(60.0), node.log
 
 
-def wait_until(condition: Callable[[], bool], limit_s: float, what: str) -> None:
+def wait_until(
+    condition: Callable[[], bool],
+    limit_s: float,
+    what: str,
+    step: Callable[[], object] = lambda: time.sleep(0.02),
+) -> None:
     """Wait for a condition. `what` names it if the time is over."""
     end_s = time.monotonic() + limit_s
     while not condition():
         assert time.monotonic() < end_s, f"waited {limit_s:g} s for {what}"
-        time.sleep(0.02)
+        step()
 
 
 class Peer:
@@ -137,14 +123,9 @@ class Peer:
         self.also_spin: list[SingleThreadedExecutor] = []
 
     def spin_until(self, condition: Callable[[], bool], limit_s: float, what: str) -> None:
-        """Run callbacks until a condition is true. `what` names it if the time is over."""
-        end_s = time.monotonic() + limit_s
-        while not condition():
-            assert time.monotonic() < end_s, f"waited {limit_s:g} s for {what}"
-            self._spin_once()
+        wait_until(condition, limit_s, what, self._spin_once)
 
     def spin_for(self, duration_s: float) -> None:
-        """Run callbacks for a duration."""
         end_s = time.monotonic() + duration_s
         while time.monotonic() < end_s:
             self._spin_once()
@@ -154,33 +135,27 @@ class Peer:
             executor.spin_once(timeout_sec=0.01)
 
     def listen(
-        self, kind: type, topic: str, depth: int = 100, *, latched: bool = False
+        self,
+        kind: type,
+        topic: str,
+        depth: int = 100,
+        *,
+        latched: bool = False,
+        parts: Callable[[Any], Any] = lambda message: [message],
     ) -> list[Any]:
-        """A list that receives the messages of a topic."""
-        messages: list[Any] = []
+        """A list that receives the messages of a topic, or parts of them."""
+        received: list[Any] = []
         profile = reliable(depth, latched=latched)
-        self.node.create_subscription(kind, topic, messages.append, profile)
-        return messages
+        self.node.create_subscription(kind, topic, lambda it: received.extend(parts(it)), profile)
+        return received
 
     def collect(self, topic: str, depth: int = 100, *, latched: bool = False) -> list[str]:
-        """A list that receives the texts of a topic."""
-        texts: list[str] = []
-        profile = reliable(depth, latched=latched)
-        self.node.create_subscription(
-            String, topic, lambda message: texts.append(message.data), profile
-        )
-        return texts
+        return self.listen(String, topic, depth, latched=latched, parts=lambda it: [it.data])
 
     def statuses(self) -> list[DiagnosticStatus]:
-        """A list that receives the diagnostics of all nodes."""
-        statuses: list[DiagnosticStatus] = []
-        self.node.create_subscription(
-            DiagnosticArray, "/diagnostics", lambda message: statuses.extend(message.status), 50
-        )
-        return statuses
+        return self.listen(DiagnosticArray, "/diagnostics", 50, parts=lambda it: it.status)
 
     def close(self) -> None:
-        """End the node and its context."""
         self._executor.shutdown(timeout_sec=1.0)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
@@ -188,7 +163,6 @@ class Peer:
 
 @contextlib.contextmanager
 def peer(name: str = "test_peer") -> Iterator[Peer]:
-    """A peer that is closed at the end."""
     made = Peer(name)
     try:
         yield made
@@ -220,7 +194,6 @@ class Camera:
         )
 
     def publish(self, message: RawRoleMessage, data: bytes) -> None:
-        """Publish serialized data on the topic of a message."""
         self._publishers[message.role].publish(data)
 
     def frames(self) -> Iterator[int]:

@@ -1,9 +1,8 @@
 """A node in the process of the test, publishers on its input topics, and valid messages."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -16,17 +15,20 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
+from support import merging
 from support.failing_backend import Backend
-from support.nodes import Peer
+from support.nodes import peer
 
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.perception import Perception
 from deworldsg_ros.ros import models
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.streams.images import fill_image
 from deworldsg_ros.streams.poses import set_stamp
 from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.codec import local_graph_to_message
 
 WIDTH, HEIGHT = 64, 48
 STEP_NS = 100 * 10**6
@@ -34,7 +36,6 @@ LIMIT_S = 20.0
 
 
 def stamped(message: Any, stamp_ns: int, frame_id: str = "camera") -> Any:
-    """The message, with this stamp and frame."""
     set_stamp(message, stamp_ns)
     message.header.frame_id = frame_id
     return message
@@ -91,36 +92,19 @@ def frame_graph(stamp_ns: int) -> wire.FrameGraphMessage:
     )
 
 
-def local_graph(stamp_ns: int) -> wire.LocalGraphMessage:
-    return wire.LocalGraphMessage(
-        **schema(wire.LocalGraphMessage, stamp_ns, "map"),
-        width=WIDTH,
-        height=HEIGHT,
-        T_world_camera=np.eye(4).ravel().tolist(),
-        objects=[
-            wire.LiftedObject(
-                instance=1,
-                box_xyxy=[1.0, 1.0, 9.0, 9.0],
-                score=0.9,
-                class_probabilities=[0.9, 0.1],
-                mean_m=[0.0, 0.0, 1.0],
-                covariance_m2=(0.01 * np.eye(3)).ravel().tolist(),
-                depth_m=1.0,
-                pixel_count=50,
-            )
-        ],
-        relations=[],
+def local_graph(
+    stamp_ns: int, count: int = 1, predicates: tuple[str, ...] = ("on",)
+) -> wire.LocalGraphMessage:
+    """A chair, and a cup beside it if there are two."""
+    graph = merging.local_graph(
+        stamp_ns,
+        np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]])[:count],
+        np.tile(0.01 * np.eye(3), (count, 1, 1)),
+        np.array([[0.9, 0.1], [0.1, 0.9]])[:count],
+        vocabulary=Vocabulary(("chair", "cup"), predicates),
+        frame_id="map",
     )
-
-
-def two_objects(stamp_ns: int) -> wire.LocalGraphMessage:
-    """A chair and a cup beside it."""
-    message = local_graph(stamp_ns)
-    message.predicates = ["on", "under", "near"]
-    (chair,) = message.objects
-    cup = {"instance": 2, "class_probabilities": [0.1, 0.9], "mean_m": [0.1, 0.0, 1.0]}
-    message.objects.append(msgspec.structs.replace(chair, **cup))
-    return message
+    return local_graph_to_message(replace(graph, width=WIDTH, height=HEIGHT))
 
 
 def evidence(stamp_ns: int) -> wire.RelationEvidenceMessage:
@@ -134,12 +118,16 @@ def overrides(parameters: dict[str, Any]) -> list[Parameter]:
 
 
 @contextlib.contextmanager
-def alone(make: type[StageNode], parameters: dict[str, Any] | None = None) -> Iterator[Any]:
-    """A node that nobody spins, for its methods."""
+def alone(
+    make: type[StageNode], parameters: dict[str, Any] | None = None, **options: Any
+) -> Iterator[Any]:
+    """A node that nobody spins, in a context of its own: one allows one message type per topic."""
+    if parameters is not None:
+        options["parameter_overrides"] = overrides(parameters)
     context = rclpy.Context()
     rclpy.init(context=context)
     try:
-        node = make(context=context, parameter_overrides=overrides(parameters or {}))
+        node = make(context=context, **options)
         try:
             yield node
         finally:
@@ -149,7 +137,7 @@ def alone(make: type[StageNode], parameters: dict[str, Any] | None = None) -> It
         rclpy.try_shutdown(context=context)
 
 
-class Bench:
+class Bench(contextlib.ExitStack):
     """A node in the process of the test, and a peer with publishers on its input topics.
 
     `parameters` are the node's overrides, by name; `with` closes both.
@@ -163,16 +151,13 @@ class Bench:
         parameters: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        if parameters is not None:
-            options["parameter_overrides"] = overrides(parameters)
-        self.peer = Peer("bench")
-        # The node has its own context, because a context allows one message type per topic.
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context)
-        self.node = make(context=self._context, **options)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-        self.peer.also_spin.append(self._executor)
+        super().__init__()
+        self.peer = self.enter_context(peer("bench"))
+        self.node = self.enter_context(alone(make, parameters, **options))
+        self.executor = SingleThreadedExecutor(context=self.node.context)
+        self.executor.add_node(self.node)
+        self.callback(self.executor.shutdown, timeout_sec=1.0)
+        self.peer.also_spin.append(self.executor)
         self._publishers = {
             topic: self.peer.node.create_publisher(kind, topic, qos or reliable(50))
             for topic, kind in topics.items()
@@ -183,12 +168,6 @@ class Bench:
             LIMIT_S,
             "the node to subscribe",
         )
-
-    def __enter__(self) -> Bench:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def send(self, **messages: Any) -> None:
         """Publish messages. A keyword is a topic with __ for /."""
@@ -205,7 +184,6 @@ class Bench:
         self.send(**{name: make(stamp_ns) for name, make in makers.items() if make is not None})
 
     def next_stamp(self) -> int:
-        """The stamp of the next frame, nanoseconds."""
         self.stamp_ns += STEP_NS
         return self.stamp_ns
 
@@ -216,7 +194,6 @@ class Bench:
         return self.node.health.products
 
     def expect(self, condition: Callable[[], bool], what: str) -> None:
-        """Run callbacks until a condition is true."""
         self.peer.spin_until(condition, LIMIT_S, f"{what}; drops are {self.node.health.drops}")
 
     def refuses(self, reason: str, provoke: Callable[[], None], number: int = 1) -> None:
@@ -226,18 +203,6 @@ class Bench:
         self.expect(
             lambda: self.node.health.drops.get(reason, 0) >= before + number, f"a drop of {reason}"
         )
-
-    def close(self) -> None:
-        self._executor.shutdown(timeout_sec=1.0)
-        self.node.close()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
-        self.peer.close()
-
-
-def bench(make: type[StageNode], topics: dict[str, type]) -> Iterator[Bench]:
-    with Bench(make, topics) as made:
-        yield made
 
 
 CAMERA = {
@@ -267,25 +232,21 @@ def send_frame(at: Bench, **changes: Any) -> None:
 def send_pair(at: Bench) -> int:
     """Send an image and a local graph of two objects; returns their stamp."""
     stamp_ns = at.next_stamp()
-    at.send(rgb__image_raw=rgb(stamp_ns), deworldsg__local_graph=two_objects(stamp_ns))
+    pair = local_graph(stamp_ns, 2, ("on", "under", "near"))
+    at.send(rgb__image_raw=rgb(stamp_ns), deworldsg__local_graph=pair)
     return stamp_ns
 
 
-def fake_perception(patch: pytest.MonkeyPatch) -> Backend:
+def fake_perception(patch: pytest.MonkeyPatch) -> None:
     """Nodes are made with this test double of all models."""
-    backend = Backend()
     patch.setattr(
         models,
         "build_perception",
-        lambda config, *, world_up: Perception(
-            backend, backend, backend, config, world_up=world_up
-        ),
+        lambda config, **options: Perception(*[Backend()] * 3, config, **options),
     )
-    return backend
 
 
 def works(at: Bench, send: Callable[[], None]) -> None:
-    """Expect a product after valid input."""
     before = at.products()
     send()
     at.expect(lambda: at.products() > before, "a product")

@@ -1,7 +1,5 @@
 """Synthetic RGB-D scenes with known masks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,12 +18,7 @@ CAMERA_HEIGHT_M = 1.5
 
 @dataclass
 class Slab:
-    """An axis-aligned box. Its frame has z up and its origin on the floor below the camera.
-
-    Attributes:
-        low, high: (3,) metres; x right, y forward, z up.
-        colour: RGB.
-    """
+    """An axis-aligned box, metres: x right, y forward, z up, from the floor below the camera."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -35,14 +28,7 @@ class Slab:
 def render(slabs: list[Slab], noise_m: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """RGB, depth and the slab of each pixel (H, W), counted from 1; 0 = floor or back wall."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
-    rays_camera = np.stack(
-        [
-            (u - INTRINSICS.cx) / INTRINSICS.fx,
-            (v - INTRINSICS.cy) / INTRINSICS.fy,
-            np.ones(SHAPE),
-        ],
-        axis=2,
-    )
+    rays_camera = INTRINSICS.back_project(u, v, np.ones(SHAPE))
     right = np.array([1.0, 0.0, 0.0])
     forward_camera = np.array([0.0, 0.0, 1.0])
     forward = forward_camera - (forward_camera @ UP_CAMERA) * UP_CAMERA
@@ -76,7 +62,6 @@ def render(slabs: list[Slab], noise_m: float = 0.0) -> tuple[np.ndarray, np.ndar
 
 
 def segmented(names, instances, depth_m):
-    """Objects with equal scores for a relation head."""
     scores = np.full(len(names), 0.8)
     instances = instances.astype(np.uint16)
     return SegmentedObjects(names, scores, None, instances, depth_m, INTRINSICS, UP_CAMERA)

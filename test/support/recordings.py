@@ -1,7 +1,5 @@
 """Small recordings of a moving camera: bags and folders in all layouts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
@@ -13,8 +11,15 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from deworldsg_ros.recordings import source as ros
 from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage
-from deworldsg_ros.recordings.source import RoleMessage, typestore
-from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion, quaternion_from_rotation
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions
+from deworldsg_ros.recordings.recording import Recording, open_recording
+from deworldsg_ros.recordings.source import typestore
+from deworldsg_ros.scene.camera import (
+    Intrinsics,
+    RgbdFrame,
+    pose_from_quaternion,
+    quaternion_from_rotation,
+)
 
 WIDTH, HEIGHT = 64, 48
 INTRINSICS = Intrinsics(60.0, 61.0, 31.5, 23.5, WIDTH, HEIGHT)
@@ -51,26 +56,35 @@ def encoded(pixels: np.ndarray, suffix: str = ".png") -> bytes:
     return bytes(cv2.imencode(suffix, pixels)[1])
 
 
-def raw_image(index: int, pixels: np.ndarray, encoding: str) -> Any:
+SCAN = b"\xff\xda"  # begins a scan of a JPEG
+
+
+def many_scans(jpeg: bytes, number: int) -> bytes:
+    """A JPEG whose last scan is repeated until it has this number of scans."""
+    last, end = jpeg.rindex(SCAN), len(jpeg) - 2
+    return jpeg[:end] + jpeg[last:end] * (number - jpeg.count(SCAN)) + jpeg[end:]
+
+
+def raw_image(time_ns: int, pixels: np.ndarray, encoding: str) -> Any:
+    pixels = np.ascontiguousarray(pixels)
     return typestore().types[ros.IMAGE](
-        header=ros.header(stamp_ns(index), CAMERA),
+        header=ros.header(time_ns, CAMERA),
         height=pixels.shape[0],
         width=pixels.shape[1],
         encoding=encoding,
         is_bigendian=0,
         step=pixels.strides[0],
-        data=np.frombuffer(np.ascontiguousarray(pixels).tobytes(), np.uint8),
+        data=np.frombuffer(pixels.tobytes(), np.uint8),
     )
 
 
-def pose_message(index: int, T_camera_child: Any = None) -> RoleMessage:
-    T = pose(index) if T_camera_child is None else pose(index) @ T_camera_child
-    return ros.pose_stamped(stamp_ns(index), WORLD, T[:3, 3], quaternion_from_rotation(T[:3, :3]))
+def pose_message(time_ns: int, T: np.ndarray) -> Any:
+    return ros.pose_stamped_from_matrix(time_ns, WORLD, T).message
 
 
-def odometry(index: int, child: str = CAMERA, T_camera_child: Any = None) -> Any:
+def odometry(time_ns: int, T: np.ndarray, child: str = CAMERA) -> Any:
     types = typestore().types
-    at = pose_message(index, T_camera_child=T_camera_child).message
+    at = pose_message(time_ns, T)
     zero = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
     return types[ros.ODOMETRY](
         header=at.header,
@@ -83,22 +97,17 @@ def odometry(index: int, child: str = CAMERA, T_camera_child: Any = None) -> Any
     )
 
 
-def transform(time_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
+def tf(time_ns: int, *edges: tuple[str, str, np.ndarray]) -> Any:
+    """Transforms: parent, child and the pose of the child."""
     types = typestore().types
-    x, y, z = map(float, T[:3, 3])
-    qx, qy, qz, qw = map(float, quaternion_from_rotation(T[:3, :3]))
-    return types[ros.TF_MESSAGE](
-        transforms=[
-            types["geometry_msgs/msg/TransformStamped"](
-                header=ros.header(time_ns, parent),
-                child_frame_id=child,
-                transform=types["geometry_msgs/msg/Transform"](
-                    translation=types["geometry_msgs/msg/Vector3"](x=x, y=y, z=z),
-                    rotation=types["geometry_msgs/msg/Quaternion"](x=qx, y=qy, z=qz, w=qw),
-                ),
-            )
-        ]
-    )
+    transforms = []
+    for parent, child, T in edges:
+        at = pose_message(time_ns, T).pose
+        place = types["geometry_msgs/msg/Vector3"](at.position.x, at.position.y, at.position.z)
+        moved = types["geometry_msgs/msg/Transform"](place, at.orientation)
+        stamped = types["geometry_msgs/msg/TransformStamped"]
+        transforms.append(stamped(ros.header(time_ns, parent), child, moved))
+    return types[ros.TF_MESSAGE](transforms)
 
 
 Item = tuple[str, str, int, Any]
@@ -112,7 +121,9 @@ def camera_items(count: int, *, compressed: bool = True, with_pose: bool = True)
         info = ros.camera_info(time_ns, CAMERA, INTRINSICS).message
         items.append(("/camera/color/camera_info", ros.CAMERA_INFO, time_ns, info))
         if with_pose:
-            items.append(("/camera/pose", ros.POSE_STAMPED, time_ns, pose_message(index).message))
+            items.append(
+                ("/camera/pose", ros.POSE_STAMPED, time_ns, pose_message(time_ns, pose(index)))
+            )
         bgr = np.ascontiguousarray(rgb_pixels(index)[:, :, ::-1])
         if compressed:
             depth = ros.compressed_depth(time_ns, CAMERA, encoded(depth_mm(index))).message
@@ -124,8 +135,13 @@ def camera_items(count: int, *, compressed: bool = True, with_pose: bool = True)
         else:
             metres = (depth_mm(index) * np.float32(1e-3)).astype(np.float32)
             items += [
-                ("/camera/depth/image_raw", ros.IMAGE, time_ns, raw_image(index, metres, "32FC1")),
-                ("/camera/color/image_raw", ros.IMAGE, time_ns, raw_image(index, bgr, "bgr8")),
+                (
+                    "/camera/depth/image_raw",
+                    ros.IMAGE,
+                    time_ns,
+                    raw_image(time_ns, metres, "32FC1"),
+                ),
+                ("/camera/color/image_raw", ros.IMAGE, time_ns, raw_image(time_ns, bgr, "bgr8")),
             ]
     return items
 
@@ -211,3 +227,8 @@ def write_tum(
         text = [f"{ns // 10**9}.{ns % 10**9:09d} {content}" for ns, content in lines]
         (folder / f"{name}.txt").write_text("\n".join(["# timestamp and content", *text]) + "\n")
     return folder
+
+
+def frames_of(path: Path, inputs: Any = None, **options: Any) -> tuple[list[RgbdFrame], Recording]:
+    with closing(open_recording(path, inputs, options=DatasetOptions(**options))) as recording:
+        return list(recording.frames()), recording

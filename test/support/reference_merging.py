@@ -16,23 +16,6 @@ def hellinger(mean_i, covariance_i, mean_j, covariance_j) -> float:
     return math.sqrt(1 - math.exp(-max(exponent, 0.0)))
 
 
-def class_distance(classes_i: np.ndarray, classes_j: np.ndarray) -> np.ndarray:
-    """D_c = 1 - Σ p_i p_j of class distributions (..., C) (Eq. 5)."""
-    return np.asarray(1.0 - np.sum(classes_i * classes_j, axis=-1))
-
-
-def may_merge(
-    hellinger_distances: np.ndarray,
-    class_distances: np.ndarray,
-    hellinger_threshold: float,
-    class_distance_threshold: float,
-) -> np.ndarray:
-    """HD < δ_g and D_c < δ_c, both strictly (Eq. 6)."""
-    return np.asarray(
-        (hellinger_distances < hellinger_threshold) & (class_distances < class_distance_threshold)
-    )
-
-
 class ReferenceMerging:
     """Nodes and edges by id; `smallest_margin` is the minimum distance to a threshold."""
 

@@ -7,9 +7,12 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from support.merging import set_confirmed
 
 from deworldsg_ros.config import Config
+from deworldsg_ros.graph.pairs import frame_votes
 from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.relations.geometry import MIN_SHAPE_POINTS
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.vocabulary import COCO_CLASSES, REPLICA_SSG_PREDICATES
 
@@ -94,6 +97,17 @@ def plant(x: float, y: float, z: float, size: float = 0.25, height: float = 0.43
     return Thing("potted plant", [pot, box(x, y, z + 0.13, size, size, height - 0.13)])
 
 
+DESK = {"table": table(0, 0), "cup": thing("cup", 0.3, 0.1, 0.74, 0.09, 0.09, 0.1)}
+DINNER = {
+    **DESK,
+    "chair": chair(0, 0.5),
+    "bowl": bowl(-0.2, 0, 0.74),
+    "book": thing("book", 0.1, -0.1, 0.74, 0.2, 0.28, 0.03),
+    "plant": plant(-0.6, 0.2, 0.74),
+    "fridge": thing("refrigerator", 1.3, 0, 0, 0.6, 0.6, 1.7),
+}
+
+
 def surface(parts: Sequence[Box], rng: np.random.Generator, count: int = 2000) -> np.ndarray:
     """Points (count, 3) float32 on the tops and sides of boxes, evenly."""
     low, high = (np.array([part[end] for part in parts]) for end in (0, 1))
@@ -165,6 +179,49 @@ def said(builder: GraphBuilder, ids: Mapping[str, int]) -> dict[tuple[str, str, 
         for edge in builder.full().edges
         for belief in edge.predicates
     }
+
+
+def change(builder: GraphBuilder, rng: np.random.Generator) -> None:
+    """Anything that may change a node or a pair, at random."""
+    graph = builder.graph
+    one, other = rng.choice(list(graph.nodes.slot_of), 2, replace=False).tolist()
+    kinds = ["votes"] * 4 + ["see", "near", "predict"] * 3 + ["observe", "move"] * 2
+    kind = rng.choice([*kinds, "confirm", "merge", "remove", "take over", "add"])
+    item = list(DINNER.values())[rng.integers(len(DINNER))]
+    labels = [VOCABULARY.classes.index(name) for name in ("dining table", "chair", "cup", "bowl")]
+    width = len(VOCABULARY.predicates)
+    if kind == "votes":
+        logits = rng.normal(-1, 4, (2, width))
+        graph.add_votes(one, other, frame_votes(logits) if rng.integers(3) else None)
+    elif kind == "see":
+        graph.add_visual(one, other, rng.normal(0, 3, width), 1)
+    elif kind == "near":
+        graph.add_neighbours([(one, other), (other, one)], 1)
+    elif kind == "predict":
+        builder.prior.update(rng.choice(labels, (1, 2)), rng.dirichlet(np.ones(width), 1))
+    elif kind == "observe":
+        classes = np.zeros(len(VOCABULARY.classes))
+        classes[labels] = rng.dirichlet(np.ones(len(labels)))
+        points = surface(item.parts, rng, int(rng.integers(60)))
+        graph.observe(one, np.zeros(3), np.eye(3), classes, 2, points)
+    elif kind == "move":
+        T = np.eye(4)
+        T[:3, 3] = rng.normal(0, 0.4, 3)
+        graph.move_node(one, T)
+    elif kind == "confirm":
+        set_confirmed(graph, one, bool(rng.integers(2)))
+    elif kind == "add" or len(graph) < 5:
+        node_id = add_node(builder, item, rng, frames=1)
+        if rng.integers(2):  # too few points, or just enough
+            slot, count = graph.nodes.slot(node_id), int(rng.integers(2 * MIN_SHAPE_POINTS))
+            graph.nodes.set_surface(slot, graph.nodes.surface(slot)[:count].copy())
+        set_confirmed(graph, node_id, bool(rng.integers(4)))
+    elif kind == "merge":
+        graph.merge_nodes(one, other)
+    elif kind == "remove":
+        graph.remove_node(one)
+    else:
+        graph.take_over(*sorted((one, other)))
 
 
 # Axis and end of the faces that cameras see: all but the bottom.

@@ -6,8 +6,6 @@ is small, and any version makes the same checkpoint. tools/old_checkpoints makes
 imports this module with an older version of transformers.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -70,7 +68,6 @@ def parameters_of(path: Path) -> dict[str, list]:
 
 
 def picture(*shape: int) -> torch.Tensor:
-    """A normalised input of a network."""
     return torch.from_numpy(noise("picture", list(shape))).float()
 
 
@@ -96,23 +93,18 @@ def segmenter_outputs(model) -> dict[str, torch.Tensor]:
     }
 
 
-def vjepa2_outputs(model) -> dict[str, torch.Tensor]:
-    hidden = model(picture(1, 4, 3, 32, 32), skip_predictor=True).last_hidden_state
-    return {"feature": hidden.mean(dim=1)[0]}
-
-
-def dinov2_outputs(model) -> dict[str, torch.Tensor]:
-    return {"feature": model(picture(1, 3, 56, 56)).last_hidden_state[0, 0]}
-
-
 OUTPUTS = {
     "rtdetr": detector_outputs,
     "rtdetr_v2": detector_outputs,
     "sam": segmenter_outputs,
     "sam2": segmenter_outputs,
     "sam2_video": segmenter_outputs,
-    "vjepa2": vjepa2_outputs,
-    "dinov2": dinov2_outputs,
+    "vjepa2": lambda model: {
+        "feature": model(picture(1, 4, 3, 32, 32), skip_predictor=True).last_hidden_state.mean(
+            dim=1
+        )[0]
+    },
+    "dinov2": lambda model: {"feature": model(picture(1, 3, 56, 56)).last_hidden_state[0, 0]},
 }
 
 

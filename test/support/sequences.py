@@ -1,7 +1,5 @@
 """Tiny scans in the layout of 3RScan: a camera in front of three blocks."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -3,10 +3,10 @@
 import dataclasses
 
 import numpy as np
-from support.merging import VOCABULARY, moments
+from support.merging import local_graph, moments
 
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 
 CUP, TABLE, CHAIR = 0, 1, 2
 
@@ -23,28 +23,13 @@ def frame(stamp: int, *objects: tuple[np.ndarray, int], **changes) -> LocalGraph
     """A local graph of objects, each with surface points and a class."""
     count = len(objects)
     gaussians = [moments(points, 1e-6) for points, _ in objects]
+    means = np.array([mean for mean, _ in gaussians]).reshape(-1, 3)
+    covariances = np.array([covariance for _, covariance in gaussians]).reshape(-1, 3, 3)
     classes = np.full((count, 4), 0.05)
-    for row, (_, kind) in enumerate(objects):
-        classes[row, kind] = 0.85
-    fields = {
-        "stamp_ns": stamp * 10**8,
-        "frame_id": "world",
-        "width": 640,
-        "height": 480,
-        "T_world_camera": np.eye(4),
-        "vocabulary": VOCABULARY,
-        "instance_ids": np.arange(1, count + 1),
-        "boxes_xyxy": np.tile([10.0, 10, 100, 100], (count, 1)),
-        "class_probabilities": classes.reshape(count, 4),
-        "scores": np.full(count, 0.9),
-        "means_world": np.array([mean for mean, _ in gaussians]).reshape(-1, 3),
-        "covariances_world": np.array([cov for _, cov in gaussians]).reshape(-1, 3, 3),
-        "depths_m": np.full(count, 2.0),
-        "pixel_counts": np.array([len(points) for points, _ in objects], np.int64),
-        "surface_points_world": tuple(points for points, _ in objects),
-        "relations": Relations.none(len(VOCABULARY.predicates)),
-    }
-    return LocalGraph(**{**fields, **changes})
+    classes[np.arange(count), [kind for _, kind in objects]] = 0.85
+    points = tuple(points for points, _ in objects)
+    more = {"pixel_counts": np.array([len(one) for one in points], np.int64), **changes}
+    return local_graph(stamp * 10**8, means, covariances, classes, points=points, **more)
 
 
 WHOLE = slab((0, 0, 1), (2.2, 0.8, 0.01))

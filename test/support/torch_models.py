@@ -1,7 +1,5 @@
 """Small checkpoints of the detectors and segmenters: real architectures and file formats."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small scene graphs, and sessions of random ones."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Sequence

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from support.evaluation import write_dataset
-from support.images import many_scans
+from support.recordings import many_scans
 from support.sequences import (
     BLOCKS,
     HEIGHT,

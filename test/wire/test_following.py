@@ -53,7 +53,6 @@ def change(names: dict[int, str], rng: np.random.Generator) -> list[tuple[int, i
     return [(i, j) for i in sorted(names) for j in sorted(names) if i < j and (i + j) % 3 == odd]
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=seeds)
 def test_a_replica_that_missed_nothing_is_the_graph(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -53,7 +53,6 @@ candidate = st.tuples(
 
 
 def boxes_of(rows):
-    """Boxes, scores and classes of candidates."""
     table = np.array(rows, dtype=float).reshape(-1, 6)
     boxes = np.hstack([table[:, :2], table[:, :2] + table[:, 2:4]])
     return boxes, table[:, 4], table[:, 5].astype(np.int64)
@@ -108,7 +107,6 @@ def test_decode_one_cell(level):
 
 
 def scores_of(scores):
-    """A row of class scores for each dictionary."""
     rows = np.full((len(scores), 80), 0.01)
     for row, named in zip(rows, scores):
         row[list(named)] = list(named.values())

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from support.recordings import (
     STEP_NS,
     TUM_T0_NS,
+    frames_of,
     pose,
     rgb_pixels,
     write_seven_scenes,
@@ -40,7 +41,6 @@ COUNT = 4
 
 
 def write(kind: str, root: Path) -> Path:
-    """A folder of this kind with a few frames."""
     if kind == "7scenes":
         return write_seven_scenes(root / "k", COUNT)
     if kind == "tum":
@@ -145,11 +145,6 @@ def test_folders_of_several_recordings_and_unknown_choices_are_refused(tmp_path)
 
 
 # --- TUM ---------------------------------------------------------------------------------------
-
-
-def frames_of(path, inputs=None, **options):
-    recording = open_recording(path, inputs, options=DatasetOptions(**options))
-    return list(recording.frames()), recording
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,12 @@ from support.recordings import (
     INTRINSICS,
     depth_mm,
     encoded,
+    frames_of,
     pose,
     rgb_pixels,
     write_seven_scenes,
 )
 
-from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.folders.seven_scenes import (
     BASELINE_M,
     COLOR_FX_FY_CX_CY,
@@ -21,13 +21,7 @@ from deworldsg_ros.recordings.folders.seven_scenes import (
     FIRST_STAMP_NS,
     register_depth,
 )
-from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.scene.camera import Intrinsics
-
-
-def frames_of(path, **options):
-    recording = open_recording(path, options=DatasetOptions(**options))
-    return list(recording.frames()), recording
 
 
 @pytest.mark.parametrize(("options", "step_ns"), [({}, 4e9 / 30), ({"rate_hz": 10.0}, 1e8)])
@@ -40,15 +34,6 @@ def test_registered_frames_with_their_times_and_poses(tmp_path, options, step_ns
         np.testing.assert_allclose(frame.T_world_camera, pose(index), atol=1e-7)
         np.testing.assert_allclose(frame.depth_m, depth_mm(index) * 1e-3, atol=1e-6)
         assert np.abs(frame.rgb.astype(int) - rgb_pixels(index)).mean() < 4  # JPEG
-
-
-@pytest.mark.slow
-def test_the_real_kitchen_is_read_whole(shared_dir):
-    frames, recording = frames_of(shared_dir / "data" / "redkitchen")
-    assert len(frames) == 250
-    assert not recording.drops
-    assert frames[0].rgb.shape == (480, 640, 3)
-    assert 0.4 < np.median(frames[0].depth_m[frames[0].depth_m > 0]) < 4
 
 
 # The original layout: a wall at a known distance, seen by the Kinect's two cameras.
@@ -107,8 +92,6 @@ def test_the_intrinsics_option_implies_registered_depth(tmp_path):
     np.testing.assert_allclose(frames[0].T_world_camera, np.eye(4), atol=1e-12)
     assert (frames[0].depth_m[240] > 0).all()
 
-
-# --- depth projected into the colour camera ----------------------------------------------------
 
 CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)
 

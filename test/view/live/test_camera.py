@@ -99,9 +99,6 @@ def test_points_of_the_frames_stand_in_for_those_of_the_graph():
     assert len(state.frames()) == 1
 
 
-# --- parts of a frame that come in any order become one view -----------------------------------
-
-
 def send(joiner, stamp_ns, parts=camera.PARTS, now_s=0.0, decoded=None):
     """The view that the last of these parts completes."""
     decoded = [] if decoded is None else decoded

@@ -88,9 +88,6 @@ def test_a_step_of_the_page_that_fails_is_told_and_the_page_goes_on(monkeypatch,
     assert logged == [ValueError, RuntimeError]
 
 
-# --- where they listen -------------------------------------------------------------------------
-
-
 @pytest.fixture
 def taken():
     """A port on which a program listens."""
@@ -117,9 +114,6 @@ def test_a_server_listens_on_the_chosen_port_or_the_next_free_one(
 def test_an_address_of_another_machine_is_refused(host):
     with pytest.raises(ConfigurationError, match=host):
         sources.open_sink(host, 0, "", foxglove=False)
-
-
-# --- Foxglove, with a WebSocket client ---------------------------------------------------------
 
 
 def test_a_late_client_of_foxglove_gets_the_whole_graph_and_then_the_updates():
