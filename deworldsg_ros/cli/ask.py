@@ -50,7 +50,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="print JSON for programs")]
 def query(
     words: Words, live: Live = False, namespace: Namespace = "", as_json: AsJson = False
 ) -> None:
-    """Ask a graph in words: "cup on dining table", "chair within 1 m of table".
+    """Ask a graph in words: "cup on dining table", "how many chairs", "largest plant".
 
     Every answer has its probability, its evidence, and "not sure" below odds of 2 : 1.
     """
@@ -189,6 +189,8 @@ def _print_answers(answers: Answers, frame_id: str, console: Console) -> None:
             odds_of(answer.probability),
             ("" if answer.is_sure else "[yellow]not sure:[/] ") + plain(answer.evidence),
         )
+    if answers.said is not None:
+        console.print(answers.said, highlight=False)
     if answers.found:
         console.print(table)
     for note in answers.notes:

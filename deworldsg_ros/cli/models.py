@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 
 from deworldsg_ros.base.files import parse_json, read_regular
+from deworldsg_ros.base.plugins import PARAMETERS, plugins, source_of
 from deworldsg_ros.base.words import visible, visible_lines
 from deworldsg_ros.checkpoints.cards import MAX_CARD_BYTES
 from deworldsg_ros.checkpoints.catalogue import (
@@ -74,6 +75,9 @@ def list_models(folder: Path, console: Console) -> None:
     for name in others:
         if name not in known and is_complete(folder / name):
             console.print(f"{'there':10} {name}")
+    for parameter in PARAMETERS:
+        for name, point in plugins(parameter).items():
+            console.print(f"{'plug-in':10} {name}: {parameter}, of {source_of(point)}")
     console.print(
         f"\nget one: deworldsg models get NAME --into {folder}\n"
         f"for a machine without network: run that elsewhere, copy the folder {folder}, and run "

@@ -8,7 +8,8 @@ from typing import Any
 
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.boxes import gap_m, horizontal_gap_m, vertical_gap_m
-from deworldsg_ros.client.objects import HiddenObject, Relation, SceneObject, is_class, odds_of
+from deworldsg_ros.client.meanings import is_class
+from deworldsg_ros.client.objects import HiddenObject, Relation, SceneObject, odds_of
 from deworldsg_ros.graph.provenance import SeenFrames
 
 # Two boxes are in contact below this gap: the error of a measured extent.

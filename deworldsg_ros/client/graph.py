@@ -5,13 +5,14 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from deworldsg_ros.base.words import counted
+from deworldsg_ros.base.words import counted, visible
 from deworldsg_ros.client.boxes import Triple, box_of, footprint, gap_m
 from deworldsg_ros.client.changes import Changes, changes_by_id, changes_by_place
 from deworldsg_ros.client.explain import (
@@ -22,13 +23,21 @@ from deworldsg_ros.client.explain import (
     explain_relation,
 )
 from deworldsg_ros.client.goals import ROBOT_RADIUS_M, Goal, free_direction, goal_near
+from deworldsg_ros.client.meanings import (
+    KNOWN,
+    is_called,
+    is_class,
+    meant_by,
+    more_general,
+    near_names,
+    words_of,
+)
 from deworldsg_ros.client.objects import (
     HiddenObject,
     Point,
     Relation,
     SceneObject,
     hidden_object,
-    is_class,
     predicate_names,
     relation_of,
     scene_object,
@@ -196,6 +205,32 @@ def cheapest_chain(
 Which = SceneObject | int | str
 
 
+# Characters of a name in an error.
+MOST_SHOWN = 60
+
+
+@dataclass(frozen=True)
+class Understood:
+    """How the name of a class was understood.
+
+    Attributes:
+        asked: the name.
+        meant: the name that is used; another one if the graph has only a more general class.
+        labels: the classes of the graph that it means, sorted.
+    """
+
+    asked: str
+    meant: str
+    labels: tuple[str, ...]
+
+    @property
+    def note(self) -> str | None:
+        """For people: ``mug: taken as cup``; None if the name is that of each class."""
+        if all(is_called(words_of(self.asked), label) for label in self.labels):
+            return None
+        return f"{self.asked}: taken as {', '.join(self.labels)}"
+
+
 class SceneGraph:
     """A graph at one moment, for questions. It never changes.
 
@@ -274,6 +309,50 @@ class SceneGraph:
         hidden = self.message.hidden
         return [hidden_object(node) for node in hidden] if isinstance(hidden, list) else None
 
+    def understand(self, name: str) -> Understood:
+        """How the name of a class is understood here.
+
+        "table" means "dining table", too, "sofa" means "couch", "seat" every chair and couch. If
+        the graph knows no mug, "mug" means "cup".
+
+        Raises:
+            ClientError: if nothing is called so; it names what is spelt alike.
+        """
+        found = self._understand(name)
+        if found is not None:
+            return found
+        words = words_of(name)
+        for known in (" ".join(words[at:]) for at in range(1, len(words))):
+            if self._understand(known) is not None:
+                unknown = " ".join(words[: -len(known.split())])
+                raise ClientError(f"'{visible(unknown)}' is not understood; '{visible(known)}' is")
+        alike = near_names(" ".join(words), self._known)
+        raise ClientError(
+            f"'{visible(name[:MOST_SHOWN])}' is the name of no class; "
+            + (f"spelt alike: {visible(', '.join(alike))}; " if alike else "")
+            + f"classes of the graph: {visible(', '.join(self.labels)) or 'none'}"
+        )
+
+    def _understand(self, name: str) -> Understood | None:
+        plain_name = " ".join(words_of(name))
+        # What objects most probably are comes before what they may be.
+        for known in (self.labels, self._known):
+            for meant in (name, *more_general(plain_name)):
+                labels = tuple(sorted(label for label in known if is_class(meant, label)))
+                if labels:
+                    return Understood(name, meant, labels)
+        is_known = not KNOWN.isdisjoint(meant_by(plain_name))
+        return Understood(name, name, ()) if is_known else None
+
+    @cached_property
+    def _known(self) -> frozenset[str]:
+        """All classes that an object of the graph may have, also a hidden one."""
+        listed = {belief.label for node in self._nodes.values() for belief in node.classes}
+        return frozenset({*listed, *self.labels, *(item.label for item in self.hidden or ())})
+
+    def _meant(self, which: Which | None) -> Which | None:
+        return self.understand(which).meant if isinstance(which, str) else which
+
     def objects(
         self,
         label: str | None = None,
@@ -285,14 +364,19 @@ class SceneGraph:
         """Objects, the most probable first; with `near`, the nearest first.
 
         Args:
-            label: class, e.g. "cup"; "table" includes "dining table".
+            label: class, e.g. "cup"; see `understand`.
             near: a point, or an object, which is not part of the answer.
             within: largest distance of the box from `near`, metres.
             min_probability: least probability of being an object of the class. By default an object
                 is of its most probable class.
+
+        Raises:
+            ClientError: for a word that no class is called.
         """
         if near is None and within is not None:
             raise ClientError("within needs near: a point or an object")
+        if label is not None:
+            label = self.understand(label).meant
         items = map(self.__getitem__, self._candidates(label, near, within, min_probability))
         found = [item for item in items if _fits(item, label, min_probability)]
         if near is None:
@@ -320,6 +404,7 @@ class SceneGraph:
             predicate: its name; "on" includes "standing on"; None = the most probable one.
             min_probability: that it holds.
         """
+        subject, object = map(self._meant, (subject, object))
         is_subject, is_object = self._chooser(subject), self._chooser(object)
         names = None if predicate is None else predicate_names(predicate)
         found = []

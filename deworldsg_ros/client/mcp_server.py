@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from deworldsg_ros import __version__
 from deworldsg_ros.base.words import whole_number
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
@@ -23,6 +24,8 @@ from deworldsg_ros.scene.limits import MAX_SECONDS
 MOST_GRAPHS = 256
 # Objects and relations of one answer; an agent reads all of them.
 MOST_ANSWERS = 50
+# An object: its id, as a number or as text such as "#12", or its class.
+Named = int | str
 
 
 class GraphTools:
@@ -58,7 +61,11 @@ class GraphTools:
         }
 
     def list_relations(
-        self, subject: str = "", predicate: str = "", object: str = "", limit: int = MOST_ANSWERS
+        self,
+        subject: Named = "",
+        predicate: str = "",
+        object: Named = "",
+        limit: int = MOST_ANSWERS,
     ) -> dict[str, Any]:
         """List the relations between objects, e.g. every cup (subject) on (predicate) a table.
 
@@ -84,12 +91,13 @@ class GraphTools:
 
         Args:
             question: e.g. "cup on dining table", "chair within 0.5 m of table and near window",
-                "anything near (1, 2, 0.5) within 1 m".
+                "anything near (1, 2, 0.5) within 1 m", "how many cups", "largest plant",
+                "is the bear on the sofa". `notes` tell how the name of a class was taken.
         """
         graph = self._graph()
         return {**_about(graph), **ask(graph, question).to_dict()}
 
-    def get_object_context(self, object: str) -> dict[str, Any]:
+    def get_object_context(self, object: Named) -> dict[str, Any]:
         """Tell everything about one object: class, place, size, relations, neighbours, evidence.
 
         Args:
@@ -137,7 +145,7 @@ class GraphTools:
             )
         return answer
 
-    def goal_near(self, object: str, distance_m: float = 1.0) -> dict[str, Any]:
+    def goal_near(self, object: Named, distance_m: float = 1.0) -> dict[str, Any]:
         """Give a pose on the floor from which an object is in view, for a navigation goal.
 
         `seen_free` is the share of the robot's volume there that was seen as free; null = walls are
@@ -251,8 +259,8 @@ def _short(item: SceneObject) -> dict[str, Any]:
     return {name: values[name] for name in names}
 
 
-def _which(text: str) -> int | str | None:
-    text = text.strip().removeprefix("#")
+def _which(text: Named) -> int | str | None:
+    text = str(text).strip().removeprefix("#")
     number = whole_number(text)
     return (text or None) if number is None else number
 
@@ -307,7 +315,9 @@ def make_server(newest: Callable[[], SceneGraph], client: Any = None, edits: boo
         tools.goal_near,
         *(EditTools(client) if edits else []),
     ]
-    server = MCPServer("deworldsg", instructions=INSTRUCTIONS, log_level="WARNING")
+    server = MCPServer(
+        "deworldsg", version=__version__, instructions=INSTRUCTIONS, log_level="WARNING"
+    )
     for function in functions:
         server.tool()(reporting(function))
     return server

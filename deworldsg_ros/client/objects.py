@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -10,39 +11,11 @@ import numpy as np
 
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.boxes import Footprint, footprint
+from deworldsg_ros.client.meanings import is_class, words_of
 from deworldsg_ros.graph.extent import box_of, surface_points
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 from deworldsg_ros.wire import messages as wire
-
-# --- Names of classes and predicates as people write them.
-
-
-def words_of(name: str) -> list[str]:
-    """The words of a name in lower case; hyphens and underscores separate words."""
-    return plain(name).replace("-", " ").split()
-
-
-def is_class(asked: str, label: str) -> bool:
-    """Whether a name means a class: "table" and "tables" mean "table" and "dining table"."""
-    wanted, known = words_of(asked), words_of(label)
-    if not wanted or len(wanted) > len(known):
-        return False
-    return any(form == known[-len(form) :] for form in _singular_forms(wanted))
-
-
-def _singular_forms(words: list[str]) -> list[list[str]]:
-    *first, last = words
-    forms = [last]
-    if last.endswith("ies"):
-        forms.append(last[:-3] + "y")
-    if last.endswith("ves"):
-        forms.append(last[:-3] + "f")
-    if last.endswith("es"):
-        forms.append(last[:-2])
-    if last.endswith("s"):
-        forms.append(last[:-1])
-    return [[*first, form] for form in forms]
 
 
 def predicate_names(asked: str) -> frozenset[str]:
@@ -125,11 +98,14 @@ class SceneObject:
     @property
     def probability(self) -> float:
         """Probability that this is an object, and of the class `label`."""
-        return self.probability_of(self.label)
+        return self._share(belief for belief in self.classes if belief.label == self.label)
 
     def probability_of(self, label: str) -> float:
         """Probability that this is an object of a class; "table" includes "dining table"."""
-        share = sum(belief.probability for belief in self.classes if is_class(label, belief.label))
+        return self._share(belief for belief in self.classes if is_class(label, belief.label))
+
+    def _share(self, beliefs: Iterable[wire.Belief]) -> float:
+        share = sum(belief.probability for belief in beliefs)
         return min(share, 1.0) * (1.0 if self.existence is None else self.existence)
 
     @property

@@ -5,44 +5,76 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.graph import SceneGraph, distance_m
+from deworldsg_ros.client.meanings import is_class
 from deworldsg_ros.client.objects import (
     SURE,
     HiddenObject,
     Point,
     Relation,
     SceneObject,
-    is_class,
     odds_of,
 )
 from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 
-# --- Questions in words: "cup on dining table", "chair within 1 m of table", "what changed since
-# …".
+# --- Questions in words: "cup on dining table", "how many chairs", "is the bear on the sofa".
 #
-#     question  = "what changed" [ "since" time ] | pattern
-#     pattern   = thing { [ "and" ] condition }
+#     question  = "what changed" [ "since" time ] | [ "how many" | "is" ] pattern
+#     pattern   = [ rank ] thing { [ "and" ] condition }
 #     thing     = class | "anything"
-#     condition = predicate thing | "near" point | "within" length [ "of" ( thing | point ) ]
+#     condition = [ "not" ] predicate thing | "near" point | rank | nearest "to" ( thing | point )
+#               | "within" length [ "of" ( thing | point ) ]
+#     rank      = "largest", "smallest", "highest", … | nearest
+#     nearest   = "closest" | "nearest" | "farthest"
 #     point     = "(" x "," y "," z ")"        length = number [ "m" | "cm" ]
 #     time      = number [ "s" ] [ "ago" ]     a stamp in seconds, or seconds before the graph's
 #     stamp
 #
-# Articles and words such as "which", "where", "is" are skipped.
+# Articles and words such as "which", "where", "there" are skipped.
 
 SKIPPED = frozenset(
-    {"a", "an", "the", "is", "are", "was", "which", "where", "find", "show", "all", "that", "there"}
+    {
+        *("a", "an", "the", "is", "are", "was", "which", "where", "find", "show", "all", "that"),
+        *("there", "any", "me", "please", "do", "you", "i", "see", "can", "it", "one", "does"),
+    }
 )
-ANYTHING = frozenset({"anything", "something", "everything", "what", "*", "?"})
+ANYTHING = frozenset(
+    {
+        "anything",
+        "something",
+        "everything",
+        "what",
+        "thing",
+        "things",
+        "object",
+        "objects",
+        "*",
+        "?",
+    }
+)
 # Answers that are less probable are left out.
 MIN_PROBABILITY = 0.05
+# A person asks no longer question, and each takes time of the graph's thread.
+MAX_QUESTION = 500
+# What is compared, and whether most of it comes first.
+RANKS = {
+    **dict.fromkeys(("largest", "biggest"), ("size", True)),
+    "smallest": ("size", False),
+    "tallest": ("height", True),
+    **dict.fromkeys(("highest", "topmost"), ("place", True)),
+    "lowest": ("place", False),
+    **dict.fromkeys(("closest", "nearest"), ("distance", False)),
+    **dict.fromkeys(("farthest", "furthest"), ("distance", True)),
+}
 
-_TOKEN = re.compile(r"\([^)]*\)|[^\s,()]+")
+Kind = Literal["find", "count", "exists", "holds"]
+
+_TOKEN = re.compile(r"\([^()]*\)|[^\s,()]+|[()]")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _LENGTH = re.compile(rf"({_NUMBER})(cm|m)?")
 
@@ -56,12 +88,29 @@ class Condition:
         thing: class of the other object; None = anything.
         point: a place instead of an object.
         within_m: largest distance, metres.
+        is_negated: whether it has to be false.
     """
 
     predicate: str | None = None
     thing: str | None = None
     point: Point | None = None
     within_m: float | None = None
+    is_negated: bool = False
+
+
+@dataclass(frozen=True)
+class Rank:
+    """The order of the answers; only the first one is meant.
+
+    Attributes:
+        word: of `RANKS`.
+        thing: what is near; None = the point, or nothing.
+        point: what is near.
+    """
+
+    word: str
+    thing: str | None = None
+    point: Point | None = None
 
 
 @dataclass(frozen=True)
@@ -71,10 +120,15 @@ class Pattern:
     Attributes:
         thing: class; None = anything.
         conditions: all of them have to hold.
+        kind: ``find``, ``count`` ("how many"), ``exists`` ("is there a cup"), or ``holds`` ("is the
+            cup on …": of the most probable cup, which counts as certain).
+        rank: the order of the answers; None = the most probable first.
     """
 
     thing: str | None
     conditions: tuple[Condition, ...]
+    kind: Kind = "find"
+    rank: Rank | None = None
 
 
 @dataclass(frozen=True)
@@ -130,21 +184,48 @@ class Answers:
 
     Attributes:
         question: as asked.
-        found: the most probable first.
-        notes: what else is worth knowing, e.g. why there is no answer.
+        found: the most probable first, or by the rank that was asked for.
+        notes: what else is worth knowing: how a word was understood, why there is no answer.
+        count: of "how many": how many of them are more probable than not; else None.
+        probability: of "is there": that at least one object fulfils the question; of "is the": that
+            the most probable one does, if it exists; else None.
     """
 
     question: str
     found: tuple[Answer, ...]
     notes: tuple[str, ...] = field(default=())
+    count: int | None = None
+    probability: float | None = None
+
+    @property
+    def said(self) -> str | None:
+        """The answer to "how many" or "is there" in words; None for other questions."""
+        if self.count is not None:
+            expected = sum(answer.probability for answer in self.found)
+            return f"{self.count} (expected number: {expected:.1f})"
+        if self.probability is None:
+            return None
+        if self.probability < 1e-9:
+            return "no: nothing in the graph fulfils it"
+        word = "yes" if self.probability >= 0.5 else "no"
+        doubt = "" if max(self.probability, 1.0 - self.probability) >= SURE else ", not sure"
+        odds = odds_of(self.probability)
+        return f"{word}{doubt} ({odds if odds == 'certain' else f'odds {odds}'})"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
-        return {
+        values: dict[str, Any] = {
             "question": self.question,
             "answers": [answer.to_dict() for answer in self.found],
             "notes": list(self.notes),
         }
+        if self.count is not None:
+            values["count"] = self.count
+        if self.probability is not None:
+            values["probability"] = round(self.probability, 3)
+        if self.said is not None:
+            values["said"] = self.said
+        return values
 
 
 def parse(question: str, predicates: Collection[str] = ()) -> Pattern | Since:
@@ -157,18 +238,20 @@ def parse(question: str, predicates: Collection[str] = ()) -> Pattern | Since:
     Raises:
         ClientError: if it cannot be read.
     """
-    tokens = [token for token in _TOKEN.findall(question.rstrip(" ?.!").lower())]
+    if len(question) > MAX_QUESTION:
+        raise ClientError(
+            f"question of {len(question)} characters: expected at most {MAX_QUESTION}"
+        )
+    tokens = _TOKEN.findall(question.strip().rstrip(" ?.!").lower())
     if tokens[:2] == ["what", "changed"]:
         return _since(question, tokens[2:])
+    kind: Kind = "find"
+    if tokens[:2] == ["how", "many"]:
+        kind, tokens = "count", tokens[2:]
+    elif tokens[:1] in (["is"], ["are"]):
+        kind = "holds" if tokens[1:2] == ["the"] else "exists"
     tokens = [token for token in tokens if token not in SKIPPED]
-    reader = _Reader(question, tokens, _longest_first(predicates))
-    thing = reader.thing()
-    conditions = []
-    while reader.tokens:
-        conditions.append(reader.condition())
-    if thing is None and not conditions:
-        raise ClientError(f"question '{question}': expected a class, as in 'cup on table'")
-    return Pattern(thing, tuple(conditions))
+    return _Reader(question, tokens, _longest_first(predicates)).pattern(kind)
 
 
 class _Reader:
@@ -179,8 +262,39 @@ class _Reader:
         self.tokens = tokens
         self.names = names
 
+    def pattern(self, kind: Kind) -> Pattern:
+        rank = self.tokens.pop(0) if self.tokens[:1] and self.tokens[0] in RANKS else None
+        thing = self.thing()
+        ranks = [] if rank is None else [self._rank(rank)]
+        conditions = []
+        while self.tokens:
+            if self.tokens[0] in RANKS:
+                ranks.append(self._rank(self.tokens.pop(0)))
+            else:
+                conditions.append(self.condition())
+        if thing is None and not conditions and not ranks:
+            raise ClientError(f"question '{self.question}': expected a class, as in 'cup on table'")
+        if len(ranks) > 1:
+            words = " and ".join(found.word for found in ranks)
+            raise ClientError(f"question '{self.question}': {words}: expected one of them")
+        if kind == "holds" and not conditions:
+            kind = "exists"
+        return Pattern(thing, tuple(conditions), kind, ranks[0] if ranks else None)
+
+    def _rank(self, word: str) -> Rank:
+        if RANKS[word][0] != "distance":
+            return Rank(word)
+        if self.tokens[:1] in (["to"], ["from"], ["of"]):
+            self.tokens.pop(0)
+            if self.tokens and self.tokens[0].startswith("("):
+                return Rank(word, None, self._point())
+            return Rank(word, self.thing())
+        raise ClientError(
+            f"question '{self.question}': {word} to what? expected 'to' and a thing or a point"
+        )
+
     def thing(self) -> str | None:
-        words = []
+        words: list[str] = []
         while self.tokens and not self._at_condition():
             words.append(self.tokens.pop(0))
         name = " ".join(word for word in words if word not in ANYTHING)
@@ -194,6 +308,9 @@ class _Reader:
     def condition(self) -> Condition:
         if self.tokens[0] == "and":
             self.tokens.pop(0)
+        if self.tokens[:1] == ["not"]:
+            self.tokens.pop(0)
+            return replace(self.condition(), is_negated=True)
         if self.tokens[:1] == ["within"]:
             return self._within(None, None)
         predicate = self._predicate()
@@ -244,7 +361,9 @@ class _Reader:
         return x, y, z
 
     def _at_condition(self) -> bool:
-        return self.tokens[0] in ("and", "within") or self._match() is not None
+        token = self.tokens[0]
+        is_end = token in ("and", "not", "within", "to", "from") or token in RANKS
+        return is_end or self._match() is not None
 
     def _match(self) -> list[str] | None:
         return next((n for n in self.names if self.tokens[: len(n)] == n), None)
@@ -300,21 +419,88 @@ def ask(graph: SceneGraph, question: str) -> Answers:
     Raises:
         ClientError: if the question cannot be read.
     """
-    pattern = parse(question, {edge.predicate for edge in graph.message.edges})
-    if isinstance(pattern, Since):
-        return _seen_since(graph, question, pattern)
+    asked = parse(question, {edge.predicate for edge in graph.message.edges})
+    if isinstance(asked, Since):
+        return _seen_since(graph, question, asked)
+    pattern, notes = _understood(graph, asked)
     items = graph.objects(pattern.thing, min_probability=MIN_PROBABILITY)
+    if pattern.kind == "holds":
+        items = items[:1]
     answers = [answer for item in items if (answer := _answer(graph, pattern, item)) is not None]
     answers.sort(key=lambda answer: (-answer.probability, answer.item.id))
-    things = [pattern.thing, *(condition.thing for condition in pattern.conditions)]
-    notes = [
-        note
-        for thing in dict.fromkeys(thing for thing in things if thing is not None)
-        for note in absence_notes(thing, graph.hidden, graph.labels)
-    ]
+    if pattern.rank is not None:
+        answers, more = _ranked(graph, pattern.rank, answers)
+        notes += more
     if not answers:
         notes.insert(0, f"nothing fulfils this with {MIN_PROBABILITY:.0%} or more")
-    return Answers(question, tuple(answers), tuple(notes))
+    chances = [answer.probability for answer in answers]
+    return Answers(
+        question,
+        tuple(answers),
+        tuple(notes),
+        count=sum(chance >= 0.5 for chance in chances) if pattern.kind == "count" else None,
+        # The objects count as independent.
+        probability=1.0 - math.prod(1.0 - chance for chance in chances)
+        if pattern.kind in ("exists", "holds")
+        else None,
+    )
+
+
+def _understood(graph: SceneGraph, asked: Pattern) -> tuple[Pattern, list[str]]:
+    """The pattern with the classes that are meant, and how each was understood."""
+    notes: dict[str, None] = {}
+
+    def meant(thing: str | None) -> str | None:
+        if thing is None:
+            return None
+        understood = graph.understand(thing)
+        notes.update(dict.fromkeys(filter(None, [understood.note])))
+        notes.update(dict.fromkeys(absence_notes(understood.meant, graph.hidden, graph.labels)))
+        return understood.meant
+
+    rank = asked.rank
+    pattern = replace(
+        asked,
+        thing=meant(asked.thing),
+        conditions=tuple(replace(one, thing=meant(one.thing)) for one in asked.conditions),
+        rank=None if rank is None else replace(rank, thing=meant(rank.thing)),
+    )
+    return pattern, list(notes)
+
+
+def _ranked(graph: SceneGraph, rank: Rank, answers: list[Answer]) -> tuple[list[Answer], list[str]]:
+    """The sure answers by a rank, each with what was compared, the first one first."""
+    kind, most_first = RANKS[rank.word]
+    near: Point | SceneObject | None = rank.point
+    if rank.thing is not None:
+        others = graph.objects(rank.thing, min_probability=MIN_PROBABILITY)
+        if not others:
+            return [], []
+        near = others[0]
+
+    def value(item: SceneObject) -> tuple[float, str]:
+        if kind == "distance":
+            assert near is not None
+            gap_m = distance_m(item, near)
+            name = near.name if isinstance(near, SceneObject) else "the point"
+            return gap_m, f"{gap_m:.2f} m from {name}"
+        if kind == "size":
+            volume_m3 = math.prod(item.size_m)
+            return volume_m3, "box of " + " x ".join(f"{side:.2f}" for side in item.size_m) + " m"
+        if kind == "height":
+            return item.size_m[2], f"{item.size_m[2]:.2f} m high"
+        return item.height_m, f"{item.height_m:.2f} m above the origin"
+
+    # A doubtful object does not win by its size.
+    known = [answer for answer in answers if answer.probability >= 0.5] or answers
+    if isinstance(near, SceneObject):
+        known = [answer for answer in known if answer.item.id != near.id]
+    compared = [(value(answer.item), answer) for answer in known]
+    compared.sort(key=lambda pair: pair[0][0], reverse=most_first)
+    found = [replace(one, evidence=f"{one.evidence}; {text}") for (_, text), one in compared]
+    doubtful = len(answers) - len(known)
+    notes = [f"{counted(doubtful, 'doubtful object')} not compared"] if doubtful > 0 else []
+    return found, notes
 
 
 def since_ns(graph: SceneGraph, since: Since) -> int:
@@ -358,11 +544,16 @@ def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | 
     chance = item.probability if pattern.thing is None else item.probability_of(pattern.thing)
     if chance < MIN_PROBABILITY:
         return None
+    is_certain = pattern.kind == "holds"
     what = item.label if pattern.thing is None else pattern.thing
     words = [f"{what} {chance:.0%} in {counted(item.observations, 'frame')}"]
     relations = []
+    chance = 1.0 if is_certain else chance
     for condition in pattern.conditions:
-        part = _best_part(graph, item, condition)
+        part = _best_part(graph, item, condition, is_certain)
+        if condition.is_negated:
+            held = 0.0 if part is None else part[0]
+            part = 1.0 - held, None, f"not {_words(condition)} ({1.0 - held:.0%})"
         if part is None:
             return None
         chance *= part[0]
@@ -373,8 +564,18 @@ def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | 
     return Answer(item, chance, tuple(relations), "; ".join(words))
 
 
-def _best_part(graph: SceneGraph, item: SceneObject, condition: Condition) -> _Part | None:
-    """The most probable way to fulfil a condition."""
+def _words(condition: Condition) -> str:
+    """A condition as it is asked."""
+    thing = condition.thing or ("anything" if condition.point is None else "the point")
+    if condition.predicate is None:
+        return f"within {condition.within_m or 0.0:g} m of {thing}"
+    return f"{condition.predicate} {thing}"
+
+
+def _best_part(
+    graph: SceneGraph, item: SceneObject, condition: Condition, is_certain: bool
+) -> _Part | None:
+    """The most probable way to fulfil a condition; the other object may count as certain."""
     if condition.point is not None:
         is_close = distance_m(item, condition.point) <= (condition.within_m or 0.0)
         return (1.0, None, f"within {condition.within_m:g} m") if is_close else None
@@ -387,19 +588,28 @@ def _best_part(graph: SceneGraph, item: SceneObject, condition: Condition) -> _P
         chance = 1.0 if condition.thing is None else other.probability_of(condition.thing)
         if other.id != item.id and chance >= MIN_PROBABILITY:
             others.append((other, chance))
-    parts = [part for other in others if (part := _part(graph, item, condition, *other))]
+    parts = [
+        part
+        for other in others
+        if (part := _part(graph, item, condition, *other, 1.0 if is_certain else other[1]))
+    ]
     return max(parts, key=lambda part: part[0], default=None)
 
 
 def _part(
-    graph: SceneGraph, item: SceneObject, condition: Condition, other: SceneObject, chance: float
+    graph: SceneGraph,
+    item: SceneObject,
+    condition: Condition,
+    other: SceneObject,
+    chance: float,
+    counted_chance: float,
 ) -> _Part | None:
     of = f"{other.name} ({chance:.0%})" if condition.thing is not None else other.name
     if condition.predicate is None:
-        return chance, None, f"{distance_m(item, other):.2f} m from {of}"
+        return counted_chance, None, f"{distance_m(item, other):.2f} m from {of}"
     found = graph.relations(item, condition.predicate, other)
     if not found:
         return None
     relation = found[0]
     text = f"{relation.predicate} {of}: {relation.probability:.0%}, {relation.evidence}"
-    return chance * relation.probability, relation, text
+    return counted_chance * relation.probability, relation, text

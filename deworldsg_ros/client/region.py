@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from msgspec import structs
 
 from deworldsg_ros.client.boxes import box_of
-from deworldsg_ros.client.objects import Point, is_class
+from deworldsg_ros.client.meanings import is_class
+from deworldsg_ros.client.objects import Point
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import empty_scene_graph
 

@@ -1,4 +1,5 @@
-"""Backends by their name in the configuration. A new backend is a file and a line here.
+"""Backends by their name in the configuration. A new backend is a file and a line here, or an
+entry point of another package (`base/plugins.py`).
 
 The module of a backend is imported only if the configuration names it, because torch is optional
 and slow to import.
@@ -9,10 +10,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import msgspec
 
+from deworldsg_ros.base.plugins import PluginError, load_plugin
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.protocols import Detector, RelationHead, Segmenter
 from deworldsg_ros.perception.stage import Perception
@@ -153,6 +155,9 @@ def _torch(parameter: str, name: str, config: PerceptionConfig) -> Iterator[None
 
 
 def _choose(parameter: str, name: str, known: Mapping[str, Made]) -> Made:
-    if name not in known:
-        raise ConfigurationError(f"{parameter} is {name!r}, expected one of {', '.join(known)}")
-    return known[name]
+    if name in known:
+        return known[name]
+    try:
+        return cast(Made, load_plugin(parameter, name, known))
+    except PluginError as error:
+        raise ConfigurationError(str(error)) from error

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from deworldsg_ros.base.plugins import PluginError, load_plugin
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.world_model import WorldModel
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -59,13 +60,16 @@ def build_world_model(config: RelationsConfig, device: str = "auto") -> WorldMod
         ConfigurationError: unknown name, missing library, or a checkpoint or probe that cannot be
             used.
     """
-    if config.world_model not in WORLD_MODELS:
-        raise ConfigurationError(
-            f"relations.world_model is '{config.world_model}': "
-            f"expected one of {', '.join(WORLD_MODELS)}"
-        )
+    name = config.world_model
+    if name not in WORLD_MODELS:
+        try:
+            make = load_plugin("relations.world_model", name, WORLD_MODELS)
+        except PluginError as error:
+            raise ConfigurationError(str(error)) from error
+        made: WorldModel | None = make(config, device)
+        return made
     try:
-        return WORLD_MODELS[config.world_model](config, device)
+        return WORLD_MODELS[name](config, device)
     except ImportError as error:
         if (error.name or "").split(".")[0] not in MODEL_LIBRARIES:
             raise

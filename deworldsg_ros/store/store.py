@@ -16,7 +16,7 @@ import msgspec
 
 from deworldsg_ros.base.files import FileLock, paused_collector
 from deworldsg_ros.base.words import stamp_ns_from_text
-from deworldsg_ros.client.objects import is_class
+from deworldsg_ros.client.meanings import is_class
 from deworldsg_ros.graph.graph_files import MAX_GRAPH_BYTES, read_content
 from deworldsg_ros.scene.errors import RefusedInput, StoreError
 from deworldsg_ros.store.database import (

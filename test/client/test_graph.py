@@ -14,7 +14,7 @@ from support.view import box_at, make_edge, make_graph, make_node
 from deworldsg_ros.client import ClientError, SceneGraph
 from deworldsg_ros.client.boxes import gap_m
 from deworldsg_ros.client.graph import _fits, distance_m
-from deworldsg_ros.client.objects import is_class
+from deworldsg_ros.client.meanings import is_class
 from deworldsg_ros.client.questions import ask
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.wire import messages as wire
@@ -122,7 +122,16 @@ def test_the_client_of_files_needs_no_ros():
         ("dining table", "table", False),
         ("dining_tables", "dining table", True),
         ("shelves", "shelf", True),
-        ("teddy", "teddy bear", False),
+        ("teddy", "teddy bear", True),
+        ("bear", "teddy bear", True),
+        ("teddy", "bear", False),
+        ("sofas", "couch", True),
+        ("fridge", "refrigerator", True),
+        ("cup", "mug", True),
+        ("mug", "cup", False),
+        ("seat", "office chair", True),
+        ("appliances", "oven", True),
+        ("cup", "oven", False),
         ("glass", "wine glass", True),
     ],
 )

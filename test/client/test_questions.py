@@ -1,9 +1,11 @@
 """Questions in words."""
 
+import re
+
 import pytest
 
 from deworldsg_ros.client import ClientError
-from deworldsg_ros.client.questions import Condition, Pattern, Since, ask, parse
+from deworldsg_ros.client.questions import Condition, Pattern, Rank, Since, ask, parse
 
 ON_TABLE, NEAR_CUP = Condition("on", "table"), Condition("near", "cup")
 
@@ -25,6 +27,17 @@ ON_TABLE, NEAR_CUP = Condition("on", "table"), Condition("near", "cup")
         ),
         ("cup near (0, 0, 0)", Pattern("cup", (Condition(None, None, (0.0, 0.0, 0.0), 1.0),))),
         ("cup near table within 1 m", Pattern("cup", (Condition(None, "table", None, 1.0),))),
+        ("how many cups on the table", Pattern("cups", (ON_TABLE,), "count")),
+        ("is there any cup?", Pattern("cup", (), "exists")),
+        ("Is the cup on the table", Pattern("cup", (ON_TABLE,), "holds")),
+        ("cup not on table", Pattern("cup", (Condition("on", "table", is_negated=True),))),
+        ("the largest chair", Pattern("chair", (), "find", Rank("largest"))),
+        ("closest chair to cup", Pattern("chair", (), "find", Rank("closest", "cup"))),
+        ("which chair is closest to cup", Pattern("chair", (), "find", Rank("closest", "cup"))),
+        (
+            "cup on table nearest to (1, 2, 3)",
+            Pattern("cup", (ON_TABLE,), "find", Rank("nearest", None, (1.0, 2.0, 3.0))),
+        ),
         ("what changed since 10 s ago", Since(10.0, True)),
         ("what changed since 1750000005.5", Since(1750000005.5, False)),
         ("what changed?", Since(None, False)),
@@ -47,6 +60,10 @@ def test_patterns(question, meaning):
         ("cup near (1, 2)", "no point"),
         ("cup on (1, 2, 3)", "near or within"),
         ("cup and cup", "'cup' is no condition"),
+        ("closest cup", "closest to what"),
+        ("largest cup nearest to table", "largest and nearest"),
+        ("how many", "expected a class"),
+        ("(" * 501, "501 characters"),
         ("what changed since yesterday", "10 s ago"),
     ],
 )
@@ -81,3 +98,65 @@ def test_distances_and_times(room):
     new = ask(room, "what changed since 5 s ago")
     assert all(room.stamp_ns - a.item.first_seen_ns <= 5e9 for a in new.found)
     assert 0 < len(new.found) < len(ask(room, "what changed").found) == len(room)
+
+
+@pytest.mark.parametrize(
+    ("question", "found", "said", "note"),
+    [
+        ("where is the fridge", [11], None, "fridge: taken as refrigerator"),
+        ("mug", [13, 40], None, "mug: taken as cup"),
+        ("where is the sofa?", [39], None, "sofa: taken as couch"),
+        ("seats", [10, 8, 39, 3, 15], None, "seats: taken as chair, couch"),
+        ("any appliance", [2, 12, 11], None, "appliance: taken as microwave, oven, refrigerator"),
+        ("the television", [31], None, "television: taken as tv"),
+        ("plants", [9, 44, 32, 52], None, ""),
+        ("teddy", [42], None, ""),
+        ("how many chairs do you see", [10, 8, 15, 3], "4 (expected number: 3", ""),
+        ("how many seats near the table", [10, 8, 3, 15], "3 (", ""),
+        ("how many mugs are on the table", [13], "1 (", "mugs: taken as cup"),
+        ("how many elephants are there", [], "0 (", "no object of class 'elephants'"),
+        ("is there a cup on the dining table?", [13], "yes (odds", ""),
+        ("are there any books", [4], "yes (odds", ""),
+        ("is there an elephant?", [], "no: nothing in the graph", ""),
+        ("is the teddy bear on the sofa?", [42], "yes (odds", ""),
+        ("is the laptop on the table?", [7], "yes (odds", ""),
+        ("is the cup on the sofa?", [], "no: nothing in the graph", ""),
+        ("is the laptop not on the table?", [], "no: nothing in the graph", ""),
+        ("is the oven within 1 m of the microwave?", [12], "yes (certain)", ""),
+        ("the largest plant", [44], None, "doubtful"),
+        ("which plant is the smallest", [9], None, ""),
+        ("the biggest thing", [5], None, ""),
+        ("highest object", [30], None, ""),
+        ("the lowest chair", [10], None, ""),
+        ("which chair is closest to the fridge?", [15], None, ""),
+        ("the nearest bottle to the cup", [1], None, ""),
+        ("farthest chair from (0, 0, 0)", [15], None, ""),
+        ("bottle not on the table", [20], None, ""),
+        ("what is on the table and near the laptop", [6], None, ""),
+        ("what is on the couch", [42], None, ""),
+        ("vase on table", [6], None, ""),
+    ],
+)
+def test_questions_of_people(room, question, found, said, note):
+    answers = ask(room, question)
+    ids = [answer.item.id for answer in answers.found]
+    assert ids[: len(found)] == found and bool(ids) == bool(found)
+    assert (answers.said or "").startswith(said or "") and (answers.said is None) == (said is None)
+    assert any(note in one for one in ("", *answers.notes))
+
+
+@pytest.mark.parametrize(
+    ("question", "words"),
+    [
+        ("refridgeratr", "spelt alike: refridgerator, refrigerator"),
+        ("red mug", "'red' is not understood; 'mug' is"),
+        ("cup on the zorb", "'zorb' is the name of no class"),
+        ("((((", "'( ( ( (' is the name of no class"),
+        ("x" * 400, f"'{60 * 'x'}' is"),
+    ],
+)
+def test_unknown_words_are_named(room, question, words):
+    with pytest.raises(ClientError, match=re.escape(words)):
+        ask(room, question)
+    with pytest.raises(ClientError):
+        room.objects(question)

@@ -137,8 +137,8 @@ def test_where_the_cup_was(tmp_path):
         tmp_path,
         graph(1, 100.0, [node(1, x=0.0), node(2, "dining table")], [make_edge(1, 2)]),
         graph(2, 110.0, [node(1, x=0.05), node(2, "dining table")]),  # it trembles
-        graph(3, 120.0, [node(1, x=2.0), node(2, "desk")]),
-        graph(4, 130.0, [node(2, "desk")]),
+        graph(3, 120.0, [node(1, x=2.0), node(2, "bench")]),
+        graph(4, 130.0, [node(2, "bench")]),
     )
 
     def cups(seconds):

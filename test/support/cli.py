@@ -19,7 +19,7 @@ def environment(folder: Path) -> dict[str, str]:
     """Environment variables of the command. ROS logs go to `folder`."""
     return {
         **os.environ,
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]),
         "COLUMNS": "120",
         "ROS_LOG_DIR": str(folder / "ros"),
     }

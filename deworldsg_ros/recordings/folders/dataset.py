@@ -22,6 +22,7 @@ import cv2
 from numpy.typing import NDArray
 
 from deworldsg_ros.base.files import confined, parse_any_json, read_regular
+from deworldsg_ros.base.plugins import PluginError, load_plugin, plugins
 from deworldsg_ros.recordings.source import RawRoleMessage, Role, RoleMessage, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import UInt8, UInt16
 from deworldsg_ros.scene.errors import RecordingError
@@ -185,7 +186,8 @@ def image_format(path: Path) -> str:
 
 # --- The data sets of this folder: each class that derives from `Dataset` is found automatically.
 #
-# A new data set is one new module; no other file changes.
+# A new data set is one new module, or the entry point of another package (`base/plugins.py`); no
+# other file changes.
 
 
 def _is_dataset(item: Any) -> TypeGuard[type[Dataset]]:
@@ -219,7 +221,8 @@ def detect_dataset(path: Path) -> str | None:
             f"recording {path}: it is a data set with the scans {shown}; expected one of them, "
             f"e.g. {path / 'data' / scans[0]}"
         )
-    return next((name for name, kind in _datasets().items() if kind.looks_like(path)), None)
+    kinds = {**_datasets(), **{name: _of_plugin(name) for name in plugins("format")}}
+    return next((name for name, kind in kinds.items() if kind.looks_like(path)), None)
 
 
 def open_dataset(name: str, path: Path, options: DatasetOptions | None = None) -> Dataset:
@@ -228,15 +231,23 @@ def open_dataset(name: str, path: Path, options: DatasetOptions | None = None) -
     Raises:
         RecordingError: for an unknown name, a missing folder or a missing file.
     """
-    if name not in _datasets():
-        raise RecordingError(
-            f"format '{name}' is unknown: expected {', '.join(_datasets())}, rosbag2 or auto"
-        )
+    kind = _datasets().get(name) or _of_plugin(name)
     if not path.is_dir():
         raise RecordingError(f"recording {path}: there is no such folder")
-    return _datasets()[name](path, options or DatasetOptions())
+    return kind(path, options or DatasetOptions())
+
+
+def _of_plugin(name: str) -> type[Dataset]:
+    try:
+        kind = load_plugin("format", name, [*_datasets(), "rosbag2", "auto"])
+    except PluginError as error:
+        raise RecordingError(str(error)) from error
+    if not _is_dataset(kind):
+        raise RecordingError(f"format '{name}': expected a class that derives from Dataset")
+    return kind
 
 
 def expectations() -> str:
     """Files of a folder of each data set, in words."""
-    return "; ".join(f"{name}: {kind.expects}" for name, kind in _datasets().items())
+    kinds = [*_datasets().items(), *((name, _of_plugin(name)) for name in plugins("format"))]
+    return "; ".join(f"{name}: {kind.expects}" for name, kind in kinds)
