@@ -28,7 +28,11 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stage a: image → 2D scene graph and instance image."""
 
     detector: Annotated[
-        str, option("detector: nanodet (shipped weights, COCO classes) or rtdetr (the paper's)")
+        str,
+        option(
+            "detector: nanodet (shipped weights, COCO classes), rtdetr (RT-DETR, the paper's, "
+            "RT-DETRv2 or D-FINE), or a plug-in"
+        ),
     ] = "nanodet"
     segmenter: Annotated[
         str,

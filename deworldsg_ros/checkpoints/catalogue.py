@@ -22,17 +22,30 @@ class Published:
         name: of the folder, and for `deworldsg models get`.
         repository: id on the hub.
         purpose: options that use it.
-        licence: as its hub page states; `models get` shows the one of the download.
+            licence: as its hub page states; `models get` shows the one of the download.
+        note: classes and accuracy, as its authors publish them; empty = none.
     """
 
     name: str
     repository: str
     purpose: str
     licence: str
+    note: str = ""
 
 
 def _published(owner: str, purpose: str, licence: str, *names: str) -> list[Published]:
     return [Published(name, f"{owner}/{name}", purpose, licence) for name in names]
+
+
+def _dfine(size: str, ap: float) -> list[Published]:
+    """D-FINE of a size, for the 80 classes of COCO and the 365 of Objects365."""
+    found = [
+        Published(f"dfine-{size}-coco", f"ustc-community/dfine-{size}-coco", DETECTOR, "apache-2.0",
+                  f"80 classes, AP {ap} on COCO"),
+        Published(f"dfine-{size}-obj365", f"ustc-community/dfine-{size}-obj365", DETECTOR,
+                  "apache-2.0", "365 classes"),
+    ]  # fmt: skip
+    return found[: 1 if size == "nano" else 2]
 
 
 DETECTOR, SEGMENTER = "perception.detector: rtdetr", "perception.segmenter"
@@ -42,6 +55,11 @@ CATALOGUE = {
     for model in (
         *_published("PekingU", DETECTOR, "apache-2.0", "rtdetr_r18vd", "rtdetr_r50vd"),
         *_published("PekingU", DETECTOR, "apache-2.0", "rtdetr_v2_r50vd"),
+        *_dfine("nano", 42.8),
+        *_dfine("small", 48.5),
+        *_dfine("medium", 52.3),
+        *_dfine("large", 54.0),
+        *_dfine("xlarge", 55.8),
         *_published(
             *("facebook", f"{SEGMENTER}: sam2", "apache-2.0"),
             *(f"sam2.1-hiera-{size}" for size in ("tiny", "small", "base-plus", "large")),
@@ -62,6 +80,8 @@ CATALOGUE = {
 GROUPS: dict[str, tuple[str, ...]] = {
     "paper": ("sam2.1-hiera-tiny", "vjepa2-vitg-fpc64-384"),
     "embedded": (),
+    # Names 365 things of households, and runs on a CPU.
+    "detector": ("dfine-small-obj365",),
 }
 # What the paper needs and the hub does not have: folder, content, how to get it.
 NOT_ON_THE_HUB = (

@@ -13,7 +13,11 @@ from typing import Any
 
 import torch
 import transformers
-from transformers import RTDetrForObjectDetection, RTDetrV2ForObjectDetection
+from transformers import (
+    DFineForObjectDetection,
+    RTDetrForObjectDetection,
+    RTDetrV2ForObjectDetection,
+)
 
 from deworldsg_ros.checkpoints.catalogue import is_hub_id
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
@@ -24,6 +28,7 @@ from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 DETECTORS: dict[str, Any] = {
     "rt_detr": RTDetrForObjectDetection,
     "rt_detr_v2": RTDetrV2ForObjectDetection,
+    "d_fine": DFineForObjectDetection,
 }
 # File of the relation head, beside the detector's weights.
 HEAD_FILE = "egtr_head.safetensors"

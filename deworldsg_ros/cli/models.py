@@ -16,6 +16,7 @@ from deworldsg_ros.base.words import visible, visible_lines
 from deworldsg_ros.checkpoints.cards import MAX_CARD_BYTES
 from deworldsg_ros.checkpoints.catalogue import (
     CATALOGUE,
+    DETECTOR,
     GROUPS,
     MODELS_FOLDER,
     NOT_ON_THE_HUB,
@@ -52,6 +53,11 @@ def get_models(names: list[str], into: Path, console: Console) -> None:
             )
             _make_folder(folder)
             hub.fetch(model, folder, lambda line: console.print(f"  {line}"))
+            if published.purpose == DETECTOR:
+                console.print(
+                    "use it: --set perception.detector=rtdetr --set "
+                    f"perception.detector_path={folder}"
+                )
     if "paper" in names:
         for name, title, advice in NOT_ON_THE_HUB:
             if not (into / name).is_dir():
@@ -65,7 +71,8 @@ def list_models(folder: Path, console: Console) -> None:
     for name, model in CATALOGUE.items():
         state = _state(folder / name)
         mark = ", of config/paper.yaml" if name in paper else ""
-        console.print(f"{state:10} {name}: {model.purpose}{mark}; licence {model.licence}")
+        note = f"; {model.note}" if model.note else ""
+        console.print(f"{state:10} {name}: {model.purpose}{mark}{note}; licence {model.licence}")
     for name, title, advice in NOT_ON_THE_HUB:
         state = _state(folder / name)
         how = "" if state == "there" else f"; {advice.format(folder=folder / name)}"

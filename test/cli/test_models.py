@@ -90,7 +90,7 @@ def test_a_damaged_file_is_removed_and_only_what_is_missing_is_fetched(hub, tmp_
 def test_errors_name_the_remedy(hub, tmp_path):
     hub.files.pop("model.safetensors")
     for name, words in (
-        ("dino", "expected paper, embedded, rtdetr_r18vd"),
+        ("dino", "expected paper, embedded, detector, rtdetr_r18vd"),
         ("nobody/nothing", "check the network and the id"),
         ("dinov2-small", "model.safetensors"),
     ):

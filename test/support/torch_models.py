@@ -62,7 +62,10 @@ def random_rtdetr(version=1, **changes):
         if version == 1
         else transformers.RTDetrV2ForObjectDetection
     )
-    model = family(config).eval()
+    return _randomised(family(config).eval())
+
+
+def _randomised(model):
     with torch.no_grad():
         for name, value in model.named_parameters():
             if value.ndim > 1:
@@ -238,3 +241,37 @@ def segmented(class_names, scores, features=None):
 
 def settings(**changes):
     return PerceptionConfig(**{"device": "cpu", "threads": 1, **changes})
+
+
+def save_dfine(folder):
+    """A D-FINE with random weights, saved as on the model hub."""
+    torch.manual_seed(0)
+    backbone = transformers.HGNetV2Config(
+        stem_channels=[3, 4, 8],
+        stage_in_channels=[8, 16, 32, 64],
+        stage_mid_channels=[4, 8, 8, 16],
+        stage_out_channels=[16, 32, 64, 64],
+        stage_num_blocks=[1] * 4,
+        stage_numb_of_layers=[1] * 4,
+        embedding_size=8,
+        hidden_sizes=[16, 32, 64, 64],
+        out_features=["stage2", "stage3", "stage4"],
+    )
+    config = transformers.DFineConfig(
+        backbone_config=backbone,
+        d_model=WIDTH,
+        encoder_hidden_dim=WIDTH,
+        encoder_in_channels=[32, 64, 64],
+        encoder_ffn_dim=WIDTH,
+        decoder_in_channels=[WIDTH] * 3,
+        decoder_ffn_dim=WIDTH,
+        decoder_layers=2,
+        num_queries=QUERIES,
+        id2label=dict(enumerate(CLASSES)),
+        label2id={name: index for index, name in enumerate(CLASSES)},
+    )
+    model = _randomised(transformers.DFineForObjectDetection(config).eval())
+    model.save_pretrained(folder)
+    preprocessing = {"size": {"height": 64, "width": 64}, "do_normalize": False}
+    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
+    return model

@@ -1,4 +1,4 @@
-"""RT-DETR on torch, the paper's detector, and EGTR, the relation head on its queries."""
+"""RT-DETR and relatives on torch, and EGTR, the relation head on queries: the paper's models."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import Relations
 from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
 
-# --- RT-DETR and RT-DETRv2 on torch: the paper's detector.
+# --- RT-DETR, RT-DETRv2 and D-FINE on torch. The first is the paper's detector.
 #
 # Each object is one query of the decoder. Overlapping boxes are not suppressed.
 
@@ -43,7 +43,7 @@ PUBLIC_PREPROCESSING = Preprocessing(640, 640)
 
 
 class RtDetrDetector:
-    """Detector on an RT-DETR checkpoint.
+    """Detector on a checkpoint of RT-DETR, RT-DETRv2 or D-FINE.
 
     Args:
         config: the section `perception`: `detector_path` and `device`.
@@ -190,6 +190,8 @@ def _class_names(network: Any, card: CheckpointCard, source: CheckpointSource) -
 
 def _use_layers(model: Any, used: int, source: CheckpointSource) -> None:
     """Drop the later layers of the decoder; each layer has class and box heads of its own."""
+    if not used:
+        return
     decoder = model.model.decoder
     count = len(decoder.layers)
     if used > count:
@@ -198,7 +200,7 @@ def _use_layers(model: Any, used: int, source: CheckpointSource) -> None:
             f"expected at most the {count} of the network: lower it, or set it to 0 for all"
         )
     for part in ("layers", "class_embed", "bbox_embed"):
-        setattr(decoder, part, getattr(decoder, part)[: used or count])
+        setattr(decoder, part, getattr(decoder, part)[:used])
 
 
 def _pixel_boxes(boxes_cxcywh: Float64, width: int, height: int) -> Any:

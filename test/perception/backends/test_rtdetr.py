@@ -7,7 +7,16 @@ import msgspec
 import numpy as np
 import pytest
 from support import torch_models as models
-from support.torch_models import CLASSES, LAYERS, PREDICATES, QUERIES, image, settings, torch
+from support.torch_models import (
+    CLASSES,
+    LAYERS,
+    PREDICATES,
+    QUERIES,
+    image,
+    settings,
+    torch,
+    transformers,
+)
 
 from deworldsg_ros.checkpoints import cards
 from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, CheckpointCard
@@ -77,6 +86,27 @@ def test_all_detections_equal_the_queries_of_the_network(folders, version):
     assert np.allclose(found.boxes_xyxy[:, :3], corners, atol=1e-3)
     # The spread that makes this a test.
     assert np.ptp(found.scores) > 0.05 and np.ptp(found.boxes_xyxy[:, 0]) > 5
+
+
+def test_a_d_fine_equals_the_post_processing_of_transformers(tmp_path):
+    rgb, model = image(48, 96), models.save_dfine(tmp_path)
+    pixels = torch.from_numpy(rgb.astype(np.float32) / 255).permute(2, 0, 1)[None]
+    pixels = torch.nn.functional.interpolate(
+        pixels, size=(64, 64), mode="bilinear", antialias=True, align_corners=False
+    )
+    with torch.no_grad():
+        output = model(pixels)
+    # It lists a query once for each class, and as many as there are queries.
+    least = float(output.logits.sigmoid().flatten().sort(descending=True).values[QUERIES - 1])
+    process = transformers.RTDetrImageProcessorPil().post_process_object_detection
+    (expected,) = process(output, threshold=least - 1e-6, target_sizes=[(48, 96)])
+    best: dict[tuple, float] = {}
+    for box, score in zip(expected["boxes"].tolist(), expected["scores"].tolist()):
+        best.setdefault(tuple(box), score)
+    found = detector(tmp_path).detect(rgb, least - 1e-6)
+    assert 3 < len(found) == len(best)
+    assert np.allclose(found.scores, list(best.values()), atol=1e-4)
+    assert np.allclose(found.boxes_xyxy + 0.5, list(best), atol=1e-3)
 
 
 def test_softmax_scores_are_the_distributions_maxima(folders):
@@ -213,7 +243,9 @@ def test_a_checkpoint_that_does_not_fit_is_refused(folders, tmp_path, monkeypatc
     refused("detector_path is empty", detector, "")
     refused("no such folder", detector, "/no/such/folder")
     refused("hf download nobody/nothing", detector, "nobody/nothing")
-    refused("sam: expected rt_detr or rt_detr_v2", detector, models.save_sam(tmp_path / "sam"))
+    refused(
+        "sam: expected d_fine or rt_detr or rt_detr_v2", detector, models.save_sam(tmp_path / "sam")
+    )
     nameless = models.save_rtdetr(tmp_path / "a", labels=[f"LABEL_{i}" for i in range(3)])
     refused("does not name its 3 classes", detector, nameless)
     short = models.save_rtdetr(tmp_path / "b", card=CheckpointCard(classes=("bed",)))
