@@ -49,7 +49,7 @@ def compile_figures(setup: Setup) -> list[Figure]:
     (cold_s, cold_cpu_s), (warm_s, _) = times
     note = "`deworldsg compile`; scripts/bootstrap.sh runs it when it installs the package"
     return [
-        Figure("compile_cold", cold_s, "s", target=8, note=note + ", empty cache, by the clock"),
+        Figure("compile_cold", cold_s, "s", target=20, note=note + ", empty cache, by the clock"),
         Figure("compile_cold_processor", cold_cpu_s, "s", note=note + ", processor time"),
         Figure("compile_warm", warm_s, "s", note=note + ", everything is compiled"),
     ]

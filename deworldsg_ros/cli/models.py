@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
+import msgspec
 import typer
+from rich import box
 from rich.console import Console
+from rich.table import Table
 
 from deworldsg_ros.base.files import parse_json, read_regular
 from deworldsg_ros.base.plugins import PARAMETERS, plugins, source_of
@@ -26,7 +31,15 @@ from deworldsg_ros.checkpoints.catalogue import (
 )
 from deworldsg_ros.checkpoints.hub import SUMS_FILE, Hub, ParameterHeader, read_headers
 from deworldsg_ros.cli.configuration import EXIT_USAGE
-from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
+from deworldsg_ros.client.meanings import is_class
+from deworldsg_ros.config import Config, PerceptionConfig
+from deworldsg_ros.scene.errors import (
+    ConfigurationError,
+    DeWorldSGError,
+    RecordingError,
+    RefusedInput,
+)
+from deworldsg_ros.wire import messages as wire
 
 if TYPE_CHECKING:
     from deworldsg_ros.checkpoints.fross import Imported
@@ -104,6 +117,114 @@ def inspect_file(path: Path, console: Console) -> None:
         for header in headers:
             shape = " x ".join(map(str, header.shape)) or "scalar"
             console.print(f"  {visible(header.name)}  {header.dtype}  {shape}")
+
+
+# --- `deworldsg models measure`: detectors on a recording of the user.
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a detector made of a recording; `found` and `precision` are None without ground truth.
+
+    Attributes:
+        frames_per_s: of the whole pipeline, without reading.
+        detections: of a frame.
+        nodes: of the graph.
+        found: objects of the ground truth with a node of their class, and all of them.
+        precision: fraction of the nodes that are in the box of an object of their class.
+    """
+
+    frames_per_s: float
+    detections: float
+    nodes: int
+    found: tuple[int, int] | None = None
+    precision: float | None = None
+
+
+def measure_detectors(names: list[str], recording: Path, into: Path, console: Console) -> None:
+    """Print what the embedded detector and others make of a recording.
+
+    Args:
+        names: models of the catalogue, folders of checkpoints, or plug-ins.
+        recording: its ground truth is used if it is there (bags/README.md).
+        into: folder of the models.
+        console: terminal.
+
+    Raises:
+        DeWorldSGError: a detector or a recording that cannot be used.
+    """
+    table = Table(box=box.SIMPLE)
+    for column in ("detector", "frames/s", "boxes a frame", "nodes", "found", "precision"):
+        table.add_column(column, justify="left" if column == "detector" else "right")
+    for name in dict.fromkeys(["embedded", *names]):
+        with console.status(f"{name} …"):
+            done = _measure(name, recording, into)
+        table.add_row(
+            name,
+            f"{done.frames_per_s:.1f}",
+            f"{done.detections:.1f}",
+            str(done.nodes),
+            "-" if done.found is None else f"{done.found[0]} of {done.found[1]}",
+            "-" if done.precision is None else f"{done.precision:.2f}",
+        )
+    console.print(table)
+
+
+def _measure(name: str, recording: Path, into: Path) -> Measured:
+    # The pipeline and the evaluation are slow to import; no other command here needs them.
+    from deworldsg_ros.evaluation.graph_measures import measure, read_reference
+    from deworldsg_ros.evaluation.recorded_room import RecordedRoom
+    from deworldsg_ros.pipeline import Pipeline
+    from deworldsg_ros.recordings.recording import Recording, open_source
+
+    pipeline = Pipeline(Config(perception=_perception_of(name, into)))
+    frames, detections, seconds = 0, 0, 0.0
+    with closing(open_source(recording)) as source:
+        for frame in Recording(source).frames():
+            start_s = time.perf_counter()
+            with suppress(RefusedInput):
+                detections += len(pipeline.process(frame).perceived.frame_graph)
+            seconds += time.perf_counter() - start_s
+            frames += 1
+    if pipeline.builder is None:
+        raise RecordingError(f"recording {recording}: not one frame could be used")
+    graph = pipeline.builder.full()
+    done = Measured(frames / seconds, detections / frames, len(graph.nodes))
+    try:
+        truth = RecordedRoom(recording)
+    except RecordingError:
+        return done
+    (scan,) = truth.scans()
+    reference = read_reference(truth, scan, truth.points(scan))
+    found = measure(_in_words_of(graph, truth.vocabulary.classes), reference)
+    precision = found.matched / max(found.nodes, 1)
+    return replace(done, found=(found.found, found.objects), precision=precision)
+
+
+def _perception_of(name: str, into: Path) -> PerceptionConfig:
+    if name == "embedded":
+        return PerceptionConfig()
+    if name.partition(" ")[0] in plugins("perception.detector"):
+        return PerceptionConfig(detector=name)
+    folder = into / name if name in CATALOGUE else Path(name)
+    return PerceptionConfig(detector="rtdetr", detector_path=str(folder))
+
+
+def _in_words_of(graph: wire.SceneGraphMessage, classes: tuple[str, ...]) -> wire.SceneGraphMessage:
+    """The graph with the names of the ground truth: another detector may say "sofa" or "Couch"."""
+
+    def named(label: str) -> str:
+        return next((name for name in classes if is_class(name, label)), label)
+
+    nodes = [
+        msgspec.structs.replace(
+            node,
+            label=named(node.label),
+            classes=[wire.Belief(named(one.label), one.probability) for one in node.classes],
+        )
+        for node in graph.nodes
+    ]
+    return msgspec.structs.replace(graph, nodes=nodes)
 
 
 def _models_of(name: str) -> list[Published]:
@@ -186,6 +307,22 @@ def list_command(into: IntoFolder = MODELS_FOLDER) -> None:
     """List models that are there or missing, with their licences."""
     with _terminal() as console:
         list_models(into, console)
+
+
+@app.command("measure")
+def measure_command(
+    names: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="NAME... RECORDING",
+            help="detectors: names of `models list`, folders or plug-ins; then the recording",
+        ),
+    ],
+    into: IntoFolder = MODELS_FOLDER,
+) -> None:
+    """Compare detectors with the embedded one on a recording: speed, objects, precision."""
+    with _terminal() as console:
+        measure_detectors(names[:-1], Path(names[-1]), into, console)
 
 
 @app.command()

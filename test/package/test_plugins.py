@@ -111,3 +111,9 @@ def test_a_run_and_the_nodes_use_a_detector_and_a_format(installed, tmp_path, mo
     assert "plug-in    red_things: perception.detector, of deworldsg-example-plugin 0.1.0" in (
         listed.stdout
     )
+    measured = deworldsg(tmp_path, "models", "measure", "red_things", DEMO_ROOM, limit_s=300)
+    assert measured.returncode == 0, measured.stderr
+    rows = {cells[0]: cells[1:] for line in measured.stdout.splitlines() if (cells := line.split())}
+    found, of, objects, precision = rows["embedded"][-4:]
+    assert (of, objects) == ("of", "61") and int(found) > 20 and float(precision) > 0.5
+    assert rows["red_things"][-4:-1] == ["0", "of", "61"]
