@@ -14,10 +14,7 @@ from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.scene.errors import ConfigurationError
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+tomllib = pytest.importorskip("tomllib")  # of Python 3.11
 
 
 @pytest.fixture
