@@ -20,6 +20,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from packaging.requirements import Requirement
+
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "scripts"))
 
@@ -28,7 +30,7 @@ from requirements import requirements  # noqa: E402
 PYTHONS = ("python3.10", "python3.11", "python3.12", "python3.13")
 # Version and hash.
 Line = tuple[str, str]
-PINNED = re.compile(r"(\S+)==(\S+) --hash=sha256:(\S+)")
+PINNED = re.compile(r"([^\s\[]+)(?:\[(\S+)\])?==(\S+) --hash=sha256:(\S+)")
 NAME = re.compile(r"[<>=!~;\[ ]")
 VERSION = "import sys; print('%d.%d' % sys.version_info[:2])"
 # The extras of each profile of scripts/bootstrap.sh. `run` has the versions of `test`.
@@ -63,6 +65,18 @@ def lock(python: str, kept: dict[str, dict[str, Line]]) -> dict[str, dict[str, L
     return found
 
 
+# Extras by the name of a package. pip asks for them in a lock, too: without, it refuses a lock as
+# soon as there is a newer version than the pinned one.
+_extras: dict[str, set[str]] = {}
+
+
+def _note_extras(requirements: list[str]) -> None:
+    for requirement in map(Requirement, requirements):
+        is_used = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        if requirement.extras and is_used:
+            _extras.setdefault(_name(requirement.name), set()).update(requirement.extras)
+
+
 def _resolved(python: str, wanted: list[str], constraints: Path) -> list[dict[str, Any]]:
     # empy, of colcon, has no wheel.
     options = ["--only-binary=:all:", "--no-binary=empy", "--dry-run", "--ignore-installed"]
@@ -80,6 +94,8 @@ def _resolved(python: str, wanted: list[str], constraints: Path) -> list[dict[st
     ]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     items: list[dict[str, Any]] = json.loads(done.stdout)["install"]
+    for item in items:
+        _note_extras(item["metadata"].get("requires_dist", []))
     return items
 
 
@@ -97,8 +113,15 @@ def _name(text: str) -> str:
 
 
 def _read(path: Path) -> dict[str, Line]:
-    matches = map(PINNED.fullmatch, path.read_text(encoding="utf-8").splitlines())
-    return {match[1]: (match[2], match[3]) for match in matches if match}
+    lines = path.read_text(encoding="utf-8").splitlines()
+    matches = [match for match in map(PINNED.fullmatch, lines) if match]
+    _note_extras([f"{match[1]}[{match[2]}]" for match in matches if match[2]])
+    return {match[1]: (match[3], match[4]) for match in matches}
+
+
+def _with_extras(name: str) -> str:
+    extras = ",".join(sorted(_extras.get(name, ())))
+    return f"{name}[{extras}]" if extras else name
 
 
 def main(arguments: list[str]) -> None:
@@ -110,7 +133,7 @@ def main(arguments: list[str]) -> None:
         kept = {profile: _read(path) for profile, path in paths.items()} if add else {}
         for profile, items in lock(python, kept).items():
             lines = [
-                f"{name}=={version} --hash=sha256:{digest}\n"
+                f"{_with_extras(name)}=={version} --hash=sha256:{digest}\n"
                 for name, (version, digest) in sorted(items.items())
             ]
             paths[profile].write_text("".join(lines), encoding="utf-8")

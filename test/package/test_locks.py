@@ -14,7 +14,7 @@ from support.requirements import required
 
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 PROFILES = {"run": ("build", "run", "ros"), "test": ("build", "run", "ros", "test")}
-PINNED = re.compile(r"([a-z0-9-]+)==(\S+) --hash=sha256:([0-9a-f]{64})")
+PINNED = re.compile(r"([a-z0-9-]+)(?:\[[a-z,]+\])?==(\S+) --hash=sha256:([0-9a-f]{64})")
 PRESENT = f"{sys.version_info[0]}.{sys.version_info[1]}"
 
 
