@@ -29,6 +29,7 @@ def ready(process):
     while "ready" not in process.log.read_text():
         assert time.monotonic() < end_s
         time.sleep(0.02)
+    time.sleep(0.2)  # now it sleeps: Python may drop an interrupt while it ends an import
     return process
 
 
