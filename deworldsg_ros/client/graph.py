@@ -68,6 +68,11 @@ class GraphIndex:
     ) -> None:
         self._nodes, self._edges = nodes, edges
 
+    @property
+    def labels(self) -> list[str]:
+        """The most probable classes of all objects, sorted."""
+        return sorted(self._by_label)
+
     def called(self, label: str) -> list[int]:
         """The objects whose most probable class is meant by a name."""
         return [i for name, ids in self._by_label.items() if is_class(label, name) for i in ids]
@@ -301,7 +306,7 @@ class SceneGraph:
     @property
     def labels(self) -> list[str]:
         """The classes of the objects, sorted."""
-        return sorted({node.label for node in self._nodes.values()})
+        return self._index.labels
 
     @property
     def hidden(self) -> list[HiddenObject] | None:

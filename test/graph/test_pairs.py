@@ -114,7 +114,7 @@ def check_rows(graph: GlobalGraph) -> None:
 
 
 class Follower:
-    """Knows the pairs by row, from what a watcher is told alone."""
+    """Follows the pairs of a store, by what its watcher is told."""
 
     def __init__(self, store: PairStore) -> None:
         self.store, self.changes = store, store.watch()

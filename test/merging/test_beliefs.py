@@ -1,4 +1,4 @@
-"""Is a node an object, and of which class: against their definitions, and over a walk."""
+"""Existence and class of a node: equal to their definitions, and right over a walk."""
 
 import math
 from pathlib import Path
@@ -249,7 +249,7 @@ def log_odds(looks: list[list[tuple[float, int, float]]], rate: float) -> float:
 def test_the_log_odds_are_those_of_the_definition(seed: int) -> None:
     rng = np.random.default_rng(seed)
     records, looks, stamp_ns = records_of(1), [], 0
-    records.looks[:] = 2e12, 1e12  # so many looks that the rates stay one half
+    records.looks[:] = 2e12, 1e12  # after so many looks, the rates stay at one half
     for index in range(int(rng.integers(1, 8))):
         count = int(rng.integers(1, 5))
         scores = rng.choice([0.0, 0.2, 0.6, 0.9], count)

@@ -132,7 +132,7 @@ class Screen:
 
 
 def free_port() -> int:
-    """A port of this machine on which nobody listens."""
+    """A free port of this machine."""
     with closing(socket.create_server(("127.0.0.1", 0))) as holder:
         return int(holder.getsockname()[1])
 
