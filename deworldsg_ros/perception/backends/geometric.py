@@ -229,11 +229,6 @@ class _Pairs:
         fixed = [[name in FIXED_TO.get(subject, ()) for name in names] for subject in names]
         return np.array(fixed, dtype=bool)
 
-    def both_of(self, classes: frozenset[str]) -> Bool:
-        """(n, n) bool: both are of these classes."""
-        members = self.are(classes)
-        return members[:, None] & members[None, :]
-
 
 def _resting(pairs: _Pairs) -> Float64:
     """On, if it is not in it nor attached to it."""
