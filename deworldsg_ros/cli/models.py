@@ -173,7 +173,7 @@ def measure_detectors(names: list[str], recording: Path, into: Path, console: Co
 def _measure(name: str, recording: Path, into: Path) -> Measured:
     # The pipeline and the evaluation are slow to import; no other command here needs them.
     from deworldsg_ros.evaluation.graph_measures import measure, read_reference
-    from deworldsg_ros.evaluation.recorded_room import RecordedRoom
+    from deworldsg_ros.evaluation.recorded_room import RecordedRoom, has_ground_truth
     from deworldsg_ros.pipeline import Pipeline
     from deworldsg_ros.recordings.recording import Recording, open_source
 
@@ -190,10 +190,9 @@ def _measure(name: str, recording: Path, into: Path) -> Measured:
         raise RecordingError(f"recording {recording}: not one frame could be used")
     graph = pipeline.builder.full()
     done = Measured(frames / seconds, detections / frames, len(graph.nodes))
-    try:
-        truth = RecordedRoom(recording)
-    except RecordingError:
+    if not has_ground_truth(recording):
         return done
+    truth = RecordedRoom(recording)
     (scan,) = truth.scans()
     reference = read_reference(truth, scan, truth.points(scan))
     found = measure(_in_words_of(graph, truth.vocabulary.classes), reference)
@@ -207,7 +206,14 @@ def _perception_of(name: str, into: Path) -> PerceptionConfig:
     if name.partition(" ")[0] in plugins("perception.detector"):
         return PerceptionConfig(detector=name)
     folder = into / name if name in CATALOGUE else Path(name)
+    if name not in CATALOGUE and not (folder.is_dir() or is_hub_id(name)):
+        known = ", ".join([*plugins("perception.detector"), *_detectors()])
+        raise ConfigurationError(f"detector '{name}': expected a folder, or one of {known}")
     return PerceptionConfig(detector="rtdetr", detector_path=str(folder))
+
+
+def _detectors() -> list[str]:
+    return [name for name, model in CATALOGUE.items() if model.purpose == DETECTOR]
 
 
 def _in_words_of(graph: wire.SceneGraphMessage, classes: tuple[str, ...]) -> wire.SceneGraphMessage:
@@ -292,7 +298,7 @@ def get(
         list[str],
         typer.Argument(
             metavar="NAME…",
-            help="paper, embedded, a name of `models list`, or OWNER/NAME of the hub",
+            help="paper, embedded, detector, a name of `models list`, or OWNER/NAME of the hub",
         ),
     ],
     into: IntoFolder = MODELS_FOLDER,

@@ -141,6 +141,12 @@ def open_annotations(root: Path, layout: str) -> Annotations:
     return RecordedRoom(root) if layout == LAYOUT.name else Annotations(root, layout)
 
 
+def has_ground_truth(recording: Path) -> bool:
+    """Whether there is a file of ground truth beside a recording."""
+    whole = recording.resolve()
+    return whole.with_name(f"{whole.stem}.gt.json").exists()
+
+
 def _beside(recording: Path, suffix: str) -> Path:
     """The file of the same name beside a recording; raises RecordingError if it is missing."""
     whole = recording.resolve()
