@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
+
+import numpy as np
 
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import Relations
+from deworldsg_ros.scene.frame_graph import MaskPatch, Relations
 
 
 @dataclass(frozen=True)
@@ -20,12 +22,21 @@ class Detections:
         scores: (n,) float64 in [0, 1], the detector's own score.
         features: (n, …) float32 features of the detector for a relation head that was trained on
             them; None = none.
+        classes: names of the C classes, if they are not those of the detector at all times: a
+            detector of free text learns new ones, always at the end; None = `Detector.classes`.
+        masks: n masks, if the detector has them: then no segmenter runs; None = none.
+        embeddings: (n, D) float32, what the image shows of each object; None = none.
+        embedding_model: name of the model that made the embeddings.
     """
 
     boxes_xyxy: Float64
     class_probabilities: Float64
     scores: Float64
     features: Float32 | None = None
+    classes: tuple[str, ...] | None = None
+    masks: tuple[MaskPatch, ...] | None = None
+    embeddings: Float32 | None = None
+    embedding_model: str = ""
 
     def __post_init__(self) -> None:
         count = len(self.scores)
@@ -34,40 +45,26 @@ class Detections:
                 f"{count} scores, boxes of shape {self.boxes_xyxy.shape}, class probabilities of "
                 f"shape {self.class_probabilities.shape}; expected one row per object"
             )
-        if self.features is not None and len(self.features) != count:
-            raise ValueError(f"{count} scores, {len(self.features)} features; expected as many")
+        for name in ("features", "masks", "embeddings"):
+            values = getattr(self, name)
+            if values is not None and len(values) != count:
+                raise ValueError(f"{count} scores, {len(values)} {name}; expected as many")
 
     def __len__(self) -> int:
         return len(self.scores)
 
     def take(self, rows: Int64 | Bool | slice) -> Detections:
         """The objects of `rows` (indices, mask or slice), in that order."""
-        return Detections(
-            self.boxes_xyxy[rows],
-            self.class_probabilities[rows],
-            self.scores[rows],
-            None if self.features is None else self.features[rows],
+        kept: list[int] = np.arange(len(self))[rows].tolist()
+        return replace(
+            self,
+            boxes_xyxy=self.boxes_xyxy[rows],
+            class_probabilities=self.class_probabilities[rows],
+            scores=self.scores[rows],
+            features=None if self.features is None else self.features[rows],
+            masks=None if self.masks is None else tuple([self.masks[row] for row in kept]),
+            embeddings=None if self.embeddings is None else self.embeddings[rows],
         )
-
-
-@dataclass(frozen=True)
-class MaskPatch:
-    """Mask of one object, stored as the part of the image around it.
-
-    Attributes:
-        top, left: image row and column of the patch's first pixel.
-        pixels: (h, w) bool; h or w is 0 if the object has no pixel.
-    """
-
-    top: int
-    left: int
-    pixels: Bool
-
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """The slices of the image that the patch covers."""
-        height, width = self.pixels.shape
-        return slice(self.top, self.top + height), slice(self.left, self.left + width)
 
 
 class Detector(Protocol):
@@ -75,7 +72,10 @@ class Detector(Protocol):
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of the C classes, in the order of the distributions."""
+        """Names of the C classes, in the order of the distributions.
+
+        If they may change, each `Detections` carries its own; see there.
+        """
 
     @property
     def default_score_threshold(self) -> float:

@@ -14,7 +14,6 @@ from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.protocols import (
     Detections,
     Detector,
-    MaskPatch,
     RelationHead,
     SegmentedObjects,
     Segmenter,
@@ -22,7 +21,7 @@ from deworldsg_ros.perception.protocols import (
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16, areas, shared_areas
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, UpEstimator, quarter_turns
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import FrameGraph, MaskPatch, Relations, Vocabulary
 from deworldsg_ros.scene.limits import check_names
 
 # --- Frames of a camera that is mounted on its side, turned upright for the detector.
@@ -321,7 +320,7 @@ class Perception:
             `perceive`; 0 = it runs in the thread of `perceive` alone.
 
     Attributes:
-        vocabulary: classes of the detector and predicates of the relation head.
+        vocabulary: classes of the newest detections and predicates of the relation head.
         score_threshold: minimum score of an object, in [0, 1].
     """
 
@@ -344,7 +343,7 @@ class Perception:
         self._uprighter = Uprighter(world_up) if config.refine_detections else None
         self._failures: dict[str, str] = {}
         self._logged: set[str] = set()
-        self.vocabulary = _vocabulary(detector, relation_head)
+        self.vocabulary = _vocabulary(detector.classes, relation_head.predicates)
         self.configure(config)
 
     def configure(self, config: PerceptionConfig) -> None:
@@ -399,6 +398,8 @@ class Perception:
         self._up.observe(frame.T_world_camera)
         self._failures = {}
         found = detect()
+        if found.classes is not None and found.classes != self.vocabulary.classes:
+            self.vocabulary = _vocabulary(found.classes, self.vocabulary.predicates)
         strong = found.scores >= self.score_threshold
         objects, drops = _select(found.take(strong), intrinsics, self._refine)
         weak, _ = _select(found.take(~strong), intrinsics, self._refine)
@@ -522,9 +523,9 @@ def fills_image(boxes_xyxy: Float64, width: int, height: int) -> Bool:
     return np.asarray((margins <= BORDER_FRACTION * np.array([width, height] * 2)).all(axis=1))
 
 
-def _vocabulary(detector: Detector, relation_head: RelationHead) -> Vocabulary:
+def _vocabulary(classes: Sequence[str], predicates: Sequence[str]) -> Vocabulary:
     """The names of the models, which come from files: messages and maps have to be readable."""
-    names = Vocabulary(tuple(detector.classes), tuple(relation_head.predicates))
+    names = Vocabulary(tuple(classes), tuple(predicates))
     for kind, of_kind in (("classes", names.classes), ("predicates", names.predicates)):
         try:
             check_names(of_kind)

@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.perception import on_image
 
-from deworldsg_ros.perception.protocols import Detections, MaskPatch
+from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.perception.stage import instance_image, join_nested
+from deworldsg_ros.scene.frame_graph import MaskPatch
 
 SHAPE = (6, 7)
 
