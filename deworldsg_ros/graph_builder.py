@@ -37,7 +37,7 @@ class GraphBuilder:
 
     Args:
         config: sections ``merging``, ``relations`` and ``output`` are used.
-        vocabulary: of all local graphs to come.
+        vocabulary: of the local graphs to come; they may bring more classes.
         frame_id: world frame of all local graphs to come.
         graph, prior: to continue with, e.g. those of a map; empty ones if omitted.
 
@@ -115,8 +115,8 @@ class GraphBuilder:
                 "out_of_order",
                 f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",
             )
+        local = self.graph.admit(local)
         if self._drift is not None:
-            self.graph.check_fits(local)
             local = self._drift.align(local)
         logits = local.relations.logits
         weights = softmax_weights(logits) if logits.size else None

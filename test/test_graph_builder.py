@@ -1,5 +1,7 @@
 """The published graph: what it says depends on no history, and updates are what differs."""
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ from support.room_nodes import DINNER, VOCABULARY, change, room
 
 from deworldsg_ros.config import Config, OutputConfig, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.map_file import read_map, write_map
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import RelationEvidence, Vocabulary
 from deworldsg_ros.wire.follow import GraphReplica
 
 RULES = {
@@ -79,6 +83,49 @@ def test_an_update_is_what_two_snapshots_differ_in(
             assert (node.surface_mm is not msgspec.UNSET) == (seed == 1)
         previous, told = current, told + 1
     assert told > 5 and max(removals, key=len)
+
+
+@of_all
+def test_names_may_come_at_any_time(relations: RelationsConfig, tmp_path: Path) -> None:
+    """500 names, each frame with its own in an order of its own; a map is read in between."""
+    rng, count, predicates = np.random.default_rng(0), 500, VOCABULARY_OF_FRAMES.predicates
+    config = Config(relations=relations, output=OutputConfig(min_existence=0.0))
+    everything = tuple(f"thing {index}" for index in range(count))
+    builder = GraphBuilder(config, Vocabulary(("room",), predicates), "world")
+    knowing = GraphBuilder(config, Vocabulary(everything, predicates), "world")
+    prediction, cube = np.array([[0.8, 0.1, 0.1]]), rng.random((60, 3)) * 0.2
+    for stamp in range(2 * count - 2):
+        seen = np.array([stamp // 2, stamp // 2 + 1])
+        means = np.stack([seen % 20 * 0.6, seen // 20 * 0.6, np.ones(2)], axis=1).astype(float)
+        points = tuple((mean + cube).astype(np.float32) for mean in means)
+        names, classes = rng.permutation(seen), np.full((2, 2), 0.1)
+        classes[names == seen[:, None]] = 0.9
+        vocabulary = Vocabulary(tuple(everything[name] for name in names), predicates)
+        known = np.zeros((2, count))
+        known[:, names] = classes
+        fields = {"points": points, "pairs": [(0, 1)], "logits": np.array([[4.0, 0.0, 0.0]])}
+        boxes = stamp + 1, means, np.tile(0.003 * np.eye(3), (2, 1, 1))
+        local = local_graph(*boxes, classes, vocabulary=vocabulary, **fields)
+        for one, frame in ((builder, local), (knowing, local_graph(*boxes, known,
+                           vocabulary=knowing.graph.vocabulary, **fields))):  # fmt: skip
+            one.integrate(frame)
+            rows = frame.class_probabilities.argmax(axis=1)[None]
+            shown = (frame.stamp_ns, frame.vocabulary, np.array([[0, 1]]), rows, np.ones(1))
+            one.add_evidence(RelationEvidence(*shown, prediction, "fake"))
+        if stamp == count:
+            write_map(builder, tmp_path / "half.map")
+            builder = read_map(config, tmp_path / "half.map")
+        if stamp % 100 == 0:
+            builder.update()
+    told, expected = builder.full(), knowing.full()
+    assert [node.label for node in told.nodes] == list(everything)
+    assert [node.label for node in expected.nodes] == list(everything)
+    assert len(builder.prior) == len(knowing.prior) == count - 1
+    said = [
+        {(edge.subject, edge.object): edge.predicate for edge in graph.edges}
+        for graph in (told, expected)
+    ]
+    assert said[0] == said[1] and said[0]
 
 
 def test_a_clock_that_was_set_back_does_not_end_the_graph() -> None:

@@ -121,12 +121,15 @@ def test_a_refused_local_graph_leaves_the_graph_as_it_was(config: Config) -> Non
         builder.integrate(hostile_local_graph(rng, frame * 10**8))
     builder.update()
     good, before = hostile_local_graph(rng, 6 * 10**8), state_of(builder)
-    other = Vocabulary(("a", "b", "c", "d"), VOCABULARY.predicates)
+    other = Vocabulary(VOCABULARY.classes, ("a", "b", "c"))
+    many = Vocabulary(tuple(f"class {n}" for n in range(8190)), VOCABULARY.predicates)
+    spread = np.full((len(good), 8190), 1 / 8190)
     for change, reason in (
         ({"stamp_ns": 5 * 10**8}, "out_of_order"),
         ({"stamp_ns": 4 * 10**8}, "out_of_order"),
         ({"frame_id": "odom"}, "wrong_frame"),
         ({"vocabulary": other}, "vocabulary_mismatch"),
+        ({"vocabulary": many, "class_probabilities": spread}, "too_many_names"),
     ):
         with pytest.raises(RefusedInput) as refused:
             builder.integrate(replace(good, **change))

@@ -106,8 +106,10 @@ def test_a_late_update_contains_the_remembered_frames_only() -> None:
 
 def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
     evidence = RelationReasoner(PAPER.relations, None).observe(local_graph(0), frame(0).rgb)
-    other = Vocabulary(("cup",), ("on",))
-    for known, reason in ((VOCABULARY, "unknown_frame"), (other, "vocabulary_mismatch")):
+    names = VOCABULARY
+    other, fewer = Vocabulary(names.classes, ("on",)), Vocabulary(("cup",), names.predicates)
+    mismatch = "vocabulary_mismatch"
+    for known, reason in ((names, "unknown_frame"), (other, mismatch), (fewer, mismatch)):
         with pytest.raises(RefusedInput) as refused:
             GraphBuilder(PAPER, known, "map").add_evidence(evidence)
         assert refused.value.reason == reason

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.base.words import counted
 from deworldsg_ros.graph.edits import Edit, EditLog
 from deworldsg_ros.graph.extent import even_moments
 from deworldsg_ros.graph.nodes import SAVED, IdState, NodeIds, NodeTable, Observations
@@ -24,7 +25,8 @@ from deworldsg_ros.graph.pairs import (
 )
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
+from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary, derived
+from deworldsg_ros.scene.limits import MAX_NAMES
 from deworldsg_ros.scene.surface import NO_POINTS
 
 # --- The global 3D scene graph: Gaussian nodes, sparse directed edges, stable ids.
@@ -65,7 +67,7 @@ class GlobalGraph:
     merge, the older id stays; `resolve` follows merges.
 
     Attributes:
-        vocabulary: names of classes and predicates.
+        vocabulary: names of classes and predicates; frames bring new classes, at the end.
         frame_id: world frame.
         surface_point_capacity: maximum number of surface points of a node.
         remembered_frames: number of newest frames that `nodes_of_frame` knows.
@@ -91,6 +93,9 @@ class GlobalGraph:
         self.even_gaussians = even_gaussians
         self.nodes = NodeTable(len(vocabulary.classes), surface_point_capacity)
         self.edits = EditLog()
+        # The newest vocabulary of a frame, the graph's at that time, and its columns there.
+        self._translated: tuple[Vocabulary, Vocabulary, Int64 | None]
+        self._translated = (vocabulary, vocabulary, None)
         self._ids = NodeIds(self.nodes, remembered_frames)
         self._watchers: list[dict[int, int]] = []
         self.pairs = PairStore(self.nodes, len(vocabulary.predicates))
@@ -346,25 +351,71 @@ class GlobalGraph:
         """Votes on each unordered pair (smaller id, larger id) seen together; read only."""
         return VotesByPair(self.nodes, self.pairs)
 
-    def check_fits(self, local: LocalGraph) -> None:
-        """Raise RefusedInput unless a frame's local graph can be merged.
+    def admit(self, local: LocalGraph) -> LocalGraph:
+        """A frame's local graph with the classes of this graph, which learns those that are new.
 
-        The reasons are ``vocabulary_mismatch`` and ``wrong_frame``.
+        Raises:
+            RefusedInput: ``vocabulary_mismatch`` for other predicates, ``too_many_names`` or
+                ``wrong_frame``; the graph is unchanged.
         """
-        seen, known = local.vocabulary, self.vocabulary
-        # Identity first: to compare all names takes long.
-        if seen is not known and seen != known:
-            raise RefusedInput(
-                "vocabulary_mismatch",
-                f"local graph has {len(seen.classes)} classes and {len(seen.predicates)} "
-                f"predicates that are not the scene graph's {len(known.classes)} and "
-                f"{len(known.predicates)}",
-            )
         if local.frame_id != self.frame_id:
             raise RefusedInput(
                 "wrong_frame",
                 f"local graph is in frame {local.frame_id!r}: expected {self.frame_id!r}",
             )
+        seen = local.vocabulary
+        if seen is self.vocabulary:
+            return local
+        columns = self.class_columns(seen, learn=True)
+        if columns is None:
+            return derived(local, vocabulary=self.vocabulary)
+        classes = np.zeros((len(local), len(self.vocabulary.classes)))
+        # A name may be there twice.
+        np.add.at(classes.T, columns, local.class_probabilities.T)
+        return derived(local, vocabulary=self.vocabulary, class_probabilities=classes)
+
+    def class_columns(self, seen: Vocabulary, learn: bool = False) -> Int64 | None:
+        """The index (C,) here of each class of another vocabulary; None = the same indices.
+
+        Args:
+            seen: its predicates have to be those of the graph.
+            learn: add classes that are new, at the end; else they are a ``vocabulary_mismatch``.
+
+        Raises:
+            RefusedInput: ``vocabulary_mismatch`` or ``too_many_names``; the graph is unchanged.
+        """
+        # By identity: to compare all names takes long, and every frame has the same ones.
+        if seen is self._translated[0] and self.vocabulary is self._translated[1]:
+            return self._translated[2]
+        known = self.vocabulary
+        if seen.predicates != known.predicates:
+            raise RefusedInput(
+                "vocabulary_mismatch",
+                f"a message has {len(seen.predicates)} predicates that are not the scene graph's "
+                f"{len(known.predicates)}: do all nodes run with one configuration?",
+            )
+        new = set(seen.classes).difference(known.classes)
+        if new and not learn:
+            raise RefusedInput(
+                "vocabulary_mismatch",
+                f"a message has {counted(len(new), 'name')} of classes that the scene graph does "
+                f"not know, such as {min(new)!r}",
+            )
+        if len(known.classes) + len(new) > MAX_NAMES:
+            raise RefusedInput(
+                "too_many_names",
+                f"a frame brings {counted(len(new), 'new name')} of classes to the "
+                f"{len(known.classes)} of the scene graph: expected at most {MAX_NAMES} in all",
+            )
+        if new:
+            classes = tuple(dict.fromkeys((*known.classes, *seen.classes)))
+            self.vocabulary = known = Vocabulary(classes, known.predicates)
+            self.nodes.widen(len(classes))
+        index_of = {name: index for index, name in enumerate(known.classes)}
+        columns = np.array([index_of[name] for name in seen.classes], np.int64)
+        same = seen.classes == known.classes
+        self._translated = (seen, known, None if same else columns)
+        return self._translated[2]
 
     def add_relations(self, local: LocalGraph, node_ids: Sequence[int]) -> None:
         """Add the visual relation logits of a frame to the edges of its nodes (Eq. 9).

@@ -439,6 +439,15 @@ class NodeTable:
         for name, values in self._storage.items():
             setattr(self, name, values[:used])
 
+    def widen(self, class_count: int) -> None:
+        """Make room for more classes; the new ones have probability 0."""
+        known, used = self._storage["class_probabilities"], len(self.ids)
+        # Zeros that were never written take no memory; a copy of zeros would.
+        wider = np.zeros((len(known), class_count))
+        wider[:used, : known.shape[1]] = known[:used]
+        self._storage["class_probabilities"] = wider
+        self._show(used)
+
     def _make_point_room(self, count: int) -> None:
         """Make room for this many surface points of a node, or for as many as one may have."""
         known, used = self._storage["surface_points_world"], len(self.ids)

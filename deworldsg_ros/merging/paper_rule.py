@@ -198,7 +198,7 @@ class PaperMerging:
         Objects are processed in row order. An object may match a node that an earlier row of the
         same frame created. Relations are added when all objects have a node.
         """
-        graph.check_fits(local)
+        local = graph.admit(local)
         assigned = [self._assign(graph, local, row) for row in range(len(local))]
         node_ids = [graph.resolve(node_id) for node_id in assigned]
         graph.remember_frame(local.stamp_ns, node_ids)

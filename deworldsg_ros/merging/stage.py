@@ -33,8 +33,7 @@ class Merging(Protocol):
             The node id of each row of the local graph, after all merges of this frame.
 
         Raises:
-            RefusedInput: ``vocabulary_mismatch`` or ``wrong_frame`` if the local graph has other
-                classes and predicates, or another world frame, than the graph.
+            RefusedInput: as `GlobalGraph.admit`.
         """
         ...
 

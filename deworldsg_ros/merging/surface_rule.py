@@ -77,7 +77,7 @@ class SurfaceMerging:
 
         Two objects of one frame never become one node, even if both overlap the same node.
         """
-        graph.check_fits(local)
+        local = graph.admit(local)
         frame, rows = local, list(range(len(local)))
         if graph.edits.merged or graph.edits.separate:
             frame, rows = as_edited(graph, local, self._records)

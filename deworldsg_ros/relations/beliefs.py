@@ -477,7 +477,7 @@ class EdgeBeliefs:
             RefusedInput: ``vocabulary_mismatch``; ``unknown_frame`` if the local graph with that
                 stamp was never merged or is forgotten.
         """
-        self._check_vocabulary(evidence)
+        columns = self._graph.class_columns(evidence.vocabulary)
         node_ids = self._graph.nodes_of_frame(evidence.stamp_ns)
         if node_ids is None or (len(evidence.pairs) and evidence.pairs.max() >= len(node_ids)):
             raise RefusedInput(
@@ -485,7 +485,9 @@ class EdgeBeliefs:
                 f"relation evidence for {evidence.stamp_ns} ns: no local graph of that frame "
                 "is remembered",
             )
-        self.prior.update(evidence.pair_classes, evidence.predictions)
+        classes = evidence.pair_classes if columns is None else columns[evidence.pair_classes]
+        self.prior.grow(len(self._graph.vocabulary.classes))
+        self.prior.update(classes, evidence.predictions)
         # A pair with a prediction was already named as a neighbour in an earlier message.
         rows = evidence.pairs[~evidence.predicted].tolist()
         self._graph.add_neighbours([(node_ids[a], node_ids[b]) for a, b in rows], evidence.stamp_ns)
@@ -505,6 +507,7 @@ class EdgeBeliefs:
         Returns:
             The pairs with another message, or none; and whether all first pairs are judged.
         """
+        self.prior.grow(len(self._graph.vocabulary.classes))
         prior = self._follow_table(whole)
         self._begun = self._begun or not self.waiting
         if self._robust is not None and self._table is not None:
@@ -601,17 +604,6 @@ class EdgeBeliefs:
             {"entropy_nats": entropy, "observations": frames, "shown": both}
             for entropy, frames, both in zip(entropies, observations, shown)
         ]
-
-    def _check_vocabulary(self, evidence: RelationEvidence) -> None:
-        seen, known = evidence.vocabulary, self._graph.vocabulary
-        if seen != known:
-            raise RefusedInput(
-                "vocabulary_mismatch",
-                f"relation evidence has {len(seen.classes)} classes and {len(seen.predicates)} "
-                f"predicates; expected the graph's {len(known.classes)} and "
-                f"{len(known.predicates)}, with the same names in the same order (do all nodes "
-                "run with one configuration?)",
-            )
 
 
 @kernel

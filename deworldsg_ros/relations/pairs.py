@@ -89,9 +89,7 @@ class PairTable:
         self._graph = graph
         self._geometry = geometry
         self._model = model
-        self._inputs = PairInputs(graph.vocabulary.classes)
-        names = graph.vocabulary.classes
-        self._seating = np.array([[name in TABLES, name in SEATS] for name in names], np.float64)
+        self._learn_classes()
         self._R_up_world, self._up = np.eye(3), [0.0, 0.0, 1.0]
         self._up_world: Float64 | None = None
         self._touched = graph.watch_nodes()
@@ -105,6 +103,12 @@ class PairTable:
         # pair by now, or wait no more.
         self._new: deque[int] = deque()
         self._again: deque[int] = deque()
+
+    def _learn_classes(self) -> None:
+        """Follow the vocabulary of the graph."""
+        names = self._known_names = self._graph.vocabulary.classes
+        self._inputs = PairInputs(names)
+        self._seating = np.array([[name in TABLES, name in SEATS] for name in names], np.float64)
 
     @property
     def scene(self) -> Scene:
@@ -144,6 +148,8 @@ class PairTable:
                 others wait for the next call. None = all.
             nodes_at_most: number of nodes to measure, those that wait longest first. None = all.
         """
+        if self._known_names is not self._graph.vocabulary.classes:
+            self._learn_classes()
         self._make_room()
         self._follow_gone()
         self._find(self._follow_nodes(up_world, nodes_at_most))

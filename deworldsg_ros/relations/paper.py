@@ -87,6 +87,13 @@ class ClassPairPrior:
         """Number of class pairs that have a prior."""
         return len(self._counts)
 
+    def grow(self, class_count: int) -> None:
+        """Know this many classes, or more; new ones have no prior yet."""
+        more = class_count - self.class_count
+        if more > 0:
+            self._rows = np.pad(self._rows, (0, more), constant_values=-1)
+            self.class_count = class_count
+
     def update(self, pair_classes: Int64, predictions: Float64) -> None:
         """Add predictions; rows of NaN (no clip was encoded) are skipped.
 

@@ -171,11 +171,11 @@ class GraphServices:
         present = self._graph.builder
         # An empty graph, as after `clear`, has no names to keep.
         names = present.graph.vocabulary if present is not None and len(present.graph) else None
-        if names is not None and names != builder.graph.vocabulary:
+        if names is not None and names.predicates != builder.graph.vocabulary.predicates:
             raise RefusedInput(
                 "invalid_request",
-                f"map {request.path} has other classes or predicates than the present graph: "
-                "expected the same ones",
+                f"map {request.path} has other predicates than the present graph: expected the "
+                "same ones",
             )
         self._graph.replace(builder)
         return f"{request.path}: {builder.confirmed} nodes in frame '{builder.graph.frame_id}'"

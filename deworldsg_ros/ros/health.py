@@ -304,8 +304,10 @@ REASONS: dict[str, str] = {
     "in one version.",
     "unknown_instance": "The instance image contains an id without an object in the frame graph. "
     "Run one segmentation_node only.",
-    "vocabulary_mismatch": "A message has other classes or predicates than the graph. Run all "
-    "nodes with one configuration.",
+    "vocabulary_mismatch": "A message has other predicates than the graph. Run all nodes with one "
+    "configuration.",
+    "too_many_names": "The detector has brought more than 8192 names of classes. Let it name "
+    "classes, not instances.",
     "out_of_order": "A local graph is up to a second older than one that is already merged. Look "
     "for a second lifting_node.",
     "no_graph": "A pose correction arrived before the first local graph, and is ignored. Nothing "

@@ -66,8 +66,11 @@ def kind_table(classes: Sequence[str]) -> Float64:
 
 def fixed_table(classes: Sequence[str]) -> Bool:
     """(C, C) bool: the class of the row is usually fixed to the class of the column."""
-    table = [[name in FIXED_TO.get(subject, ()) for name in classes] for subject in classes]
-    return np.array(table, np.bool_).reshape(len(classes), len(classes))
+    table = np.zeros((len(classes), len(classes)), np.bool_)
+    for row, subject in enumerate(classes):
+        if subject in FIXED_TO:
+            table[row] = [name in FIXED_TO[subject] for name in classes]
+    return table
 
 
 # --- Predicates with the same meaning, and what a predicate says in the opposite direction.
