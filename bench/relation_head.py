@@ -25,7 +25,8 @@ from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 from deworldsg_ros.perception.protocols import SegmentedObjects
 from deworldsg_ros.perception.stage import instance_image
-from deworldsg_ros.scene.frame_graph import MaskPatch, Relations
+from deworldsg_ros.scene.camera import MaskPatch
+from deworldsg_ros.scene.frame_graph import Relations
 from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES
 
 MAX_RELATIONS = 100

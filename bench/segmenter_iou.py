@@ -28,8 +28,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
-from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import MaskPatch
+from deworldsg_ros.scene.camera import Intrinsics, MaskPatch
 
 INTRINSICS = Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
 MIN_PIXELS = 1000

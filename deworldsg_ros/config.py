@@ -31,7 +31,7 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         str,
         option(
             "detector: nanodet (shipped weights, COCO classes), rtdetr (RT-DETR, the paper's, "
-            "RT-DETRv2 or D-FINE), or a plug-in"
+            "RT-DETRv2 or D-FINE), topic (another process sends them), or a plug-in"
         ),
     ] = "nanodet"
     segmenter: Annotated[

@@ -60,6 +60,19 @@ def _frame_examples() -> dict[str, wire.Message]:
     words: dict[str, Any] = {"classes": CLASSES, "predicates": PREDICATES}
     image: dict[str, Any] = {"width": 640, "height": 480}
     return {
+        "detections": wire.DetectionsMessage(
+            **_head("detections", "camera_color_optical_frame"),
+            detections=[
+                wire.SentDetection(
+                    box_xyxy=[310.0, 180.5, 352.0, 231.0],
+                    hypotheses=[wire.NameScore("red mug", 0.71), wire.NameScore("cup", 0.2)],
+                    mask=wire.SentMask(312, 182, 4, 3, bytes([0b01101111, 0b11110000])),
+                    embedding=struct.pack("<4e", 0.5, -0.25, 0.0, 1.0),
+                ),
+                wire.SentDetection([120.0, 215.0, 560.0, 402.5], [wire.NameScore("desk", 0.83)]),
+            ],
+            embedding_model="openai/clip-vit-base-patch32",
+        ),
         "frame_graph": wire.FrameGraphMessage(
             **_head("frame_graph", "camera_color_optical_frame"),
             **image,

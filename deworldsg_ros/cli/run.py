@@ -186,7 +186,11 @@ def _run(options: RunOptions, console: Console, prepare: Callable[[], None] = la
         need_poses=options.poses.need_poses,
     )
     try:
-        recording = Recording(choose_poses(source, options.poses, config), config.inputs)
+        recording = Recording(
+            choose_poses(source, options.poses, config),
+            config.inputs,
+            with_detections=config.perception.detector == "topic",
+        )
         prepare()
         pipeline = build_pipeline(config, options.map_path, console)
         processed = _process(recording, pipeline, options, console)

@@ -12,9 +12,9 @@ import numpy as np
 from deworldsg_ros.perception.stage import Perceived, instance_image
 from deworldsg_ros.poses.trajectory import parse_numbers
 from deworldsg_ros.scene.arrays import Bool, Float64, UInt16
-from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.camera import MaskPatch, RgbdFrame
 from deworldsg_ros.scene.errors import EvaluationError
-from deworldsg_ros.scene.frame_graph import FrameGraph, MaskPatch, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 
 # --- Faults of detections that persist over frames, as picklable values.
 

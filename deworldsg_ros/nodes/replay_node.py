@@ -65,6 +65,9 @@ LISTENERS_OF_INPUTS = {
     Role.DEPTH: {SEGMENTATION, LIFTING},
     Role.CAMERA_INFO: {SEGMENTATION, LIFTING},
     Role.POSE: {SEGMENTATION, LIFTING},
+    # segmentation_node listens to them only with `perception.detector: topic`.
+    Role.DETECTIONS: set(),
+    Role.DETECTION_INSTANCES: set(),
 }
 LOCAL_GRAPH, EVIDENCE = "deworldsg/local_graph", "deworldsg/relation_evidence"
 # Topic: its publishers, its subscribers.
@@ -387,6 +390,7 @@ CLASSES = {
     source.CAMERA_INFO: CameraInfo,
     source.POSE_STAMPED: PoseStamped,
     source.ODOMETRY: Odometry,
+    source.STRING: String,
 }
 # Messages that DDS keeps for a subscriber: more than the window of a replay, and small in memory.
 PUBLISHER_DEPTH = 10

@@ -13,7 +13,7 @@ from deworldsg_ros.perception.protocols import (
 )
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived, Perception
-from deworldsg_ros.scene.frame_graph import MaskPatch
+from deworldsg_ros.scene.camera import MaskPatch
 
 __all__ = [
     "Detections",

@@ -8,8 +8,8 @@ from typing import Protocol
 import numpy as np
 
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
-from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import MaskPatch, Relations
+from deworldsg_ros.scene.camera import Intrinsics, MaskPatch
+from deworldsg_ros.scene.frame_graph import Relations
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,12 @@ def _rtdetr(config: PerceptionConfig) -> Detector:
     return RtDetrDetector(config)
 
 
+def _topic(config: PerceptionConfig) -> Detector:
+    from deworldsg_ros.perception.source import DetectionSource
+
+    return DetectionSource()
+
+
 def _rgbd(config: PerceptionConfig) -> Segmenter:
     from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 
@@ -85,6 +91,7 @@ def _egtr(config: PerceptionConfig, detector: Detector) -> RelationHead:
 DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
     "nanodet": _nanodet,
     "rtdetr": _rtdetr,
+    "topic": _topic,
 }
 # Torch has one setting of its threads for the thread that sets it, and a GPU takes one frame after
 # the other anyway.

@@ -18,10 +18,11 @@ from deworldsg_ros.perception.protocols import (
     SegmentedObjects,
     Segmenter,
 )
+from deworldsg_ros.perception.source import DetectionSource
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16, areas, shared_areas
-from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, UpEstimator, quarter_turns
+from deworldsg_ros.scene.camera import Intrinsics, MaskPatch, RgbdFrame, UpEstimator, quarter_turns
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.frame_graph import FrameGraph, MaskPatch, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 from deworldsg_ros.scene.limits import check_names
 
 # --- Frames of a camera that is mounted on its side, turned upright for the detector.
@@ -292,10 +293,10 @@ class Perceived:
     Attributes:
         frame_graph: objects, best score first, and the relations between them.
         instances: (H, W) uint16 instance image; k + 1 on the pixels of the k-th object, else 0.
-        drops: number of dropped detections by reason: ``box_too_small`` (or outside the image),
-            ``box_is_the_view`` (fills the image), ``over_max_objects``, ``detected_twice``
-            (nested), ``segmenter_error`` (all of the frame). ``relation_head_error`` counts the
-            objects that are passed on without relations.
+        drops: number of dropped detections by reason: ``over_max_names``, ``box_too_small`` (or
+            outside the image), ``box_is_the_view`` (fills the image), ``over_max_objects``,
+            ``detected_twice`` (nested), ``segmenter_error`` (all of the frame).
+            ``relation_head_error`` counts the objects that are passed on without relations.
         failures: error message of each backend that failed on this frame, by reason.
         turns: quarter turns counter-clockwise after which perception saw the image.
     """
@@ -340,7 +341,10 @@ class Perception:
         self._relation_head = relation_head
         self._refine = config.refine_detections
         self._up = UpEstimator(world_up)
-        self._uprighter = Uprighter(world_up) if config.refine_detections else None
+        # Another process has seen the image as it is.
+        self._source = detector if isinstance(detector, DetectionSource) else None
+        upright = config.refine_detections and self._source is None
+        self._uprighter = Uprighter(world_up) if upright else None
         self._failures: dict[str, str] = {}
         self._logged: set[str] = set()
         self.vocabulary = _vocabulary(detector.classes, relation_head.predicates)
@@ -403,6 +407,8 @@ class Perception:
         strong = found.scores >= self.score_threshold
         objects, drops = _select(found.take(strong), intrinsics, self._refine)
         weak, _ = _select(found.take(~strong), intrinsics, self._refine)
+        if self._source is not None:
+            drops += self._source.take_drops()
         masks = self.segment(frame, objects, in_front_of(objects, weak))
         if masks is None:
             drops["segmenter_error"] = len(objects)
@@ -441,8 +447,12 @@ class Perception:
     def detect(self, frame: RgbdFrame) -> Detections:
         """Objects and, if refined, weak boxes of an upright frame; raises ``detector_error``."""
         fraction = WEAK_SCORE_FRACTION if self._refine else 1.0
+        if self._source is not None and frame.sent is not None:
+            return self._source.take(frame.sent, fraction * self.score_threshold)
         try:
             return self._detector.detect(frame.rgb, fraction * self.score_threshold)
+        except RefusedInput:
+            raise
         except Exception as error:  # a model can fail in more ways than can be listed
             message = self._note_failure("detector", "detector_error", error)
             raise RefusedInput("detector_error", message) from error
@@ -450,7 +460,12 @@ class Perception:
     def segment(
         self, frame: RgbdFrame, objects: Detections, weak: Detections
     ) -> list[MaskPatch] | None:
-        """A mask of each object, without the pixels of `weak`; None if the segmenter failed."""
+        """A mask of each object, without the pixels of `weak`; None if the segmenter failed.
+
+        Masks that the objects bring are taken as they are.
+        """
+        if objects.masks is not None:
+            return list(objects.masks)
         boxes_xyxy = np.concatenate([objects.boxes_xyxy, weak.boxes_xyxy])
         try:
             masks = self._segmenter.segment(frame.rgb, frame.depth_m, frame.intrinsics, boxes_xyxy)

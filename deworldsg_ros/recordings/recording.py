@@ -13,7 +13,7 @@ import msgspec
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.recordings.bags.bag import BagSource
 from deworldsg_ros.recordings.bags.storage import SALVAGERS, storage_files
-from deworldsg_ros.recordings.bags.topics import TopicChoice
+from deworldsg_ros.recordings.bags.topics import EXPECTED, TopicChoice
 from deworldsg_ros.recordings.folders.dataset import (
     DatasetOptions,
     detect_dataset,
@@ -23,6 +23,7 @@ from deworldsg_ros.recordings.folders.dataset import (
 from deworldsg_ros.recordings.source import Role, Source
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RecordingError
+from deworldsg_ros.streams.detections import read_detections
 from deworldsg_ros.streams.frames import FrameAssembler
 
 BAG_SUFFIXES = frozenset(SALVAGERS)
@@ -34,12 +35,31 @@ class Recording:
     The assembler of the nodes joins and checks the messages: a replay through DDS and a run in one
     process give the same frames.
 
+    Args:
+        source: the messages.
+        inputs: how they are joined.
+        with_detections: whether each frame needs the detections that were recorded.
+
+    Raises:
+        RecordingError: there are none.
+
     Attributes:
         source: the messages.
         reasons: one example for each reason of `drops`, if there is one.
     """
 
-    def __init__(self, source: Source, inputs: InputsConfig | None = None) -> None:
+    def __init__(
+        self,
+        source: Source,
+        inputs: InputsConfig | None = None,
+        *,
+        with_detections: bool = False,
+    ) -> None:
+        if with_detections and Role.DETECTIONS not in source.topics:
+            raise RecordingError(
+                f"recording {source.name}: perception.detector is 'topic', but it has no "
+                f"detections: expected {EXPECTED[Role.DETECTIONS]}"
+            )
         self.source = source
         self.reasons: dict[str, str] = {}
         self._assembler = FrameAssembler(
@@ -47,6 +67,7 @@ class Recording:
             msgspec.structs.replace(inputs or InputsConfig(), pose_source="auto"),
             topics={role.value: topic.name for role, topic in source.topics.items()},
             on_drop=self._remember,
+            with_detections=with_detections,
         )
 
     @property
@@ -76,6 +97,10 @@ class Recording:
             Role.DEPTH: self._assembler.add_depth,
             Role.CAMERA_INFO: self._assembler.add_camera_info,
             Role.POSE: self._assembler.add_pose,
+            Role.DETECTIONS: lambda message, _: self._assembler.add_detections(
+                read_detections(message)
+            ),
+            Role.DETECTION_INSTANCES: self._assembler.add_detection_instances,
         }
         for item in self.source.messages():
             add[item.role](item.message, item.stamp_ns)

@@ -11,7 +11,7 @@ from enum import Enum
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from deworldsg_ros.scene.arrays import Float64
@@ -28,6 +28,21 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+STRING = "std_msgs/msg/String"
+DETECTIONS = "vision_msgs/msg/Detection2DArray"
+
+# vision_msgs 4, of ROS 2 Humble and later; rosbags does not have it.
+_VISION_MSGS = {
+    "Point2D": "float64 x\nfloat64 y",
+    "Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
+    "BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
+    "ObjectHypothesis": "string class_id\nfloat64 score",
+    "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\n"
+    "geometry_msgs/PoseWithCovariance pose",
+    "Detection2D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+    "vision_msgs/BoundingBox2D bbox\nstring id",
+    "Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections",
+}
 
 # compressed_depth_image_transport writes this struct before the PNG: format, depth quantisation.
 COMPRESSED_DEPTH_HEADER = struct.pack("<iff", 0, 0.0, 0.0)
@@ -40,6 +55,8 @@ class Role(str, Enum):
     DEPTH = "depth"
     CAMERA_INFO = "camera_info"
     POSE = "pose"
+    DETECTIONS = "detections"
+    DETECTION_INSTANCES = "detection_instances"
 
 
 @dataclass(frozen=True)
@@ -61,8 +78,11 @@ class RoleMessage:
 
 @functools.lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """Message classes and CDR of ROS 2 Jazzy."""
-    return get_typestore(Stores.ROS2_JAZZY)
+    """Message classes and CDR of ROS 2 Jazzy, with detections of vision_msgs."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, fields in _VISION_MSGS.items():
+        store.register(get_types_from_msg(fields, f"vision_msgs/msg/{name}"))
+    return store
 
 
 def decode(data: bytes, msgtype: str) -> Any:
@@ -132,6 +152,11 @@ def camera_info(stamp_ns: int, frame_id: str, intrinsics: Intrinsics) -> RoleMes
         ),
     )
     return RoleMessage(Role.CAMERA_INFO, CAMERA_INFO, stamp_ns, message)
+
+
+def string_message(role: Role, stamp_ns: int, text: str) -> RoleMessage:
+    """A text, such as JSON, as std_msgs/String."""
+    return RoleMessage(role, STRING, stamp_ns, typestore().types[STRING](data=text))
 
 
 def pose_stamped(

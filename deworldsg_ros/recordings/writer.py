@@ -28,17 +28,19 @@ TOPICS = {
     (Role.DEPTH, IMAGE): "/depth/image_raw",
     (Role.DEPTH, COMPRESSED_IMAGE): "/depth/image_raw/compressedDepth",
 }
-CAMERA_INFO_TOPIC = "/rgb/camera_info"
-POSE_TOPIC = "/camera/pose"
+OTHER_TOPICS = {
+    Role.CAMERA_INFO: "/rgb/camera_info",
+    Role.POSE: "/camera/pose",
+    Role.DETECTIONS: "/deworldsg/detections",
+    Role.DETECTION_INSTANCES: "/deworldsg/detections/instances",
+}
 NO_LIMIT = QosTime(2**31 - 1, 10**9 - 1)
 
 
 def topic_of(role: Role, msgtype: str) -> str:
     """Topic of the messages of a role and type."""
-    if role is Role.CAMERA_INFO:
-        return CAMERA_INFO_TOPIC
-    if role is Role.POSE:
-        return POSE_TOPIC
+    if role in OTHER_TOPICS:
+        return OTHER_TOPICS[role]
     return TOPICS[role, msgtype]
 
 

@@ -258,6 +258,9 @@ REASONS: dict[str, str] = {
     "on `rgb/camera_info`.",
     "no_instances": "A frame graph arrived without its instance image. Use `config/fastdds.xml` "
     "in every process.",
+    "no_detections": "The detector that sends `deworldsg/detections` has sent none with the stamp "
+    "of this image. This is harmless if it is slower than the camera.",
+    "no_detection_instances": "The detections of this image came without their instance image.",
     "no_rgb": "A local graph arrived without its RGB image. Use `config/fastdds.xml` in every "
     "process.",
     "stale": "A message is not newer than the last one on its topic. Look for a second publisher.",
@@ -272,6 +275,8 @@ REASONS: dict[str, str] = {
     "the way. If the node is as fast as the camera, use `config/fastdds.xml` in every process.",
     "lost_depth": "As `lost_rgb`, for depth images.",
     "lost_instances": "As `lost_rgb`, for instance images.",
+    "lost_detections": "As `lost_rgb`, for detections.",
+    "lost_detection_instances": "As `lost_rgb`, for instance images of detections.",
     "lost_camera_info": "As `lost_rgb`, for camera_info.",
     "lost_pose": "As `lost_rgb`, for poses.",
     "lost_frame_graph": "As `lost_rgb`, for frame graphs.",
@@ -284,6 +289,9 @@ REASONS: dict[str, str] = {
     "depth has the higher rate.",
     "unmatched_instances": "An instance image arrived without its frame graph. Use "
     "`config/fastdds.xml` in every process.",
+    "unmatched_detections": "Detections belong to no RGB image. Give them the stamp of the image; "
+    "if the node is busy, it takes fewer images than the detector.",
+    "unmatched_detection_instances": "As `unmatched_detections`, for instance images.",
     "unmatched_local_graph": "Too many local graphs waited for their images, and the oldest was "
     "dropped. Use `config/fastdds.xml` in every process.",
     "unmatched_frame_graph": "Too many frame graphs waited for depth or pose, and the oldest was "
@@ -306,6 +314,8 @@ REASONS: dict[str, str] = {
     "Run one segmentation_node only.",
     "vocabulary_mismatch": "A message has other predicates than the graph. Run all nodes with one "
     "configuration.",
+    "over_max_names": "The detector of `deworldsg/detections` has used more than 2048 names. Let "
+    "it name classes, not instances.",
     "too_many_names": "The detector has brought more than 8192 names of classes. Let it name "
     "classes, not instances.",
     "out_of_order": "A local graph is up to a second older than one that is already merged. Look "

@@ -9,18 +9,24 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import String
 
 from deworldsg_ros.ros.joining import JoiningNode
 from deworldsg_ros.ros.node import CHECK_PERIOD_S, StageNode
 from deworldsg_ros.ros.qos import AutoSubscription, Source, reliable, source
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.streams.frames import PosedAssembler
+from deworldsg_ros.streams.detections import read_detections
+from deworldsg_ros.streams.frames import TOPICS, FrameAssembler, PosedAssembler
 from deworldsg_ros.streams.poses import stamp_ns_of
 
 try:  # Part of ROS 2, but not of its wheels.
     from tf2_msgs.msg import TFMessage as TFMessage  # for transform_output, too
 except ImportError:
     TFMessage = None
+try:  # as tf2_msgs
+    from vision_msgs.msg import Detection2DArray as Detection2DArray
+except ImportError:
+    Detection2DArray = None
 
 # Takes a message and its stamp in nanoseconds.
 Taker = Callable[[Any, int], None]
@@ -76,6 +82,20 @@ def listen_camera_info(node: JoiningNode[Any], take: Taker) -> None:
     sources = [source("rgb/camera_info", CameraInfo)]
     reliability = node.parameters.inputs.reliability
     node.listen("camera_info", sources, _stamped(take), reliability, POSE_DEPTH, node.wants_rest)
+
+
+def listen_detections(node: JoiningNode[Any], frames: FrameAssembler) -> None:
+    """Subscribe to the detections of another process, and to their instance image."""
+    kinds = [String] if Detection2DArray is None else [String, Detection2DArray]
+    reliability = node.parameters.inputs.reliability
+    taking = node.taking(lambda message: frames.add_detections(read_detections(message)))
+    sources = [source(TOPICS["detections"], kind) for kind in kinds]
+    node.listen("detections", sources, taking, reliability, IMAGE_DEPTH, node.wants_rest)
+    taking = node.taking(
+        lambda message: frames.add_detection_instances(message, stamp_ns_of(message))
+    )
+    sources = [source(TOPICS["detection_instances"], Image)]
+    node.listen("detection_instances", sources, taking, reliability, IMAGE_DEPTH, node.wants_rest)
 
 
 def listen_pose(node: JoiningNode[Any], frames: PosedAssembler[Any, Any]) -> None:

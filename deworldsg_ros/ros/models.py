@@ -26,6 +26,7 @@ from deworldsg_ros.ros.inputs import (
     WANTED_DEPTH,
     listen_camera_info,
     listen_depth,
+    listen_detections,
     listen_pose,
     listen_rgb,
 )
@@ -195,7 +196,10 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
             return self._models[part]
 
         self._perception.watch(supervise)
-        self._frames = FrameAssembler(inputs, **self.assembler_options())
+        self._with_detections = self.parameters.perception.detector == "topic"
+        self._frames = FrameAssembler(
+            inputs, **self.assembler_options(), with_detections=self._with_detections
+        )
         self._turns: Counter[int] = Counter()
 
     def listen_to_camera(self, work: Callable[[RgbdFrame], None]) -> None:
@@ -204,6 +208,8 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         self.join(frames, work)
         listen_camera_info(self, self.taking(frames.add_camera_info))
         listen_pose(self, frames)
+        if self._with_detections:
+            listen_detections(self, frames)
         listen_depth(self, self.taking(frames.add_depth), self.wants_depth, WANTED_DEPTH)
         listen_rgb(self, self.taking(frames.add_rgb), self.wants_images, WANTED_DEPTH)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, UInt8
 from deworldsg_ros.scene.checks import holds, within
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.limits import (
@@ -132,6 +132,52 @@ class Intrinsics:
 
 
 @dataclass(frozen=True)
+class MaskPatch:
+    """Mask of one object, stored as the part of the image around it.
+
+    Attributes:
+        top, left: image row and column of the patch's first pixel.
+        pixels: (h, w) bool; h or w is 0 if the object has no pixel.
+    """
+
+    top: int
+    left: int
+    pixels: Bool
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """The slices of the image that the patch covers."""
+        height, width = self.pixels.shape
+        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+
+
+@dataclass(frozen=True)
+class SentDetections:
+    """Objects that another process has found in an image (n objects), checked.
+
+    Attributes:
+        boxes_xyxy: (n, 4) float64 pixels, corners x1, y1, x2, y2.
+        scores: (n,) float64 in [0, 1].
+        names: what each object may be: at least one name, with
+        name_scores: the score of each name in [0, 1].
+        masks: a mask of each object, inside the image; None = the source has none.
+        embeddings: (n, D) float32; None = the source has none.
+        embedding_model: name of the model that made them.
+    """
+
+    boxes_xyxy: Float64
+    scores: Float64
+    names: tuple[tuple[str, ...], ...]
+    name_scores: tuple[tuple[float, ...], ...]
+    masks: tuple[MaskPatch, ...] | None = None
+    embeddings: Float32 | None = None
+    embedding_model: str = ""
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+
+@dataclass(frozen=True)
 class RgbdFrame:
     """One registered RGB-D image with its pose, checked.
 
@@ -142,6 +188,7 @@ class RgbdFrame:
         intrinsics: of both images.
         T_world_camera: (4, 4) float64, camera optical frame to world.
         frame_id: name of the world frame.
+        sent: objects that another process has found in the image; None = none was asked.
 
     Raises:
         RefusedInput: ``grid_mismatch`` if the sizes differ, ``invalid_pose`` for a bad pose.
@@ -153,6 +200,7 @@ class RgbdFrame:
     intrinsics: Intrinsics
     T_world_camera: Float64
     frame_id: str = "world"
+    sent: SentDetections | None = None
 
     def __post_init__(self) -> None:
         grid = (self.intrinsics.height, self.intrinsics.width)

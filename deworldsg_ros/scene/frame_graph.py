@@ -49,26 +49,6 @@ class Relations:
 
 
 @dataclass(frozen=True)
-class MaskPatch:
-    """Mask of one object, stored as the part of the image around it.
-
-    Attributes:
-        top, left: image row and column of the patch's first pixel.
-        pixels: (h, w) bool; h or w is 0 if the object has no pixel.
-    """
-
-    top: int
-    left: int
-    pixels: Bool
-
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """The slices of the image that the patch covers."""
-        height, width = self.pixels.shape
-        return slice(self.top, self.top + height), slice(self.left, self.left + width)
-
-
-@dataclass(frozen=True)
 class FrameGraph:
     """The 2D scene graph of one frame (n objects, C classes), best score first.
 

@@ -11,11 +11,12 @@ import numpy as np
 
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8, UInt16
-from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, SentDetections
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph
 from deworldsg_ros.scene.limits import checked_frame_id
 from deworldsg_ros.streams.assembler import Assembler, OnDrop, Out, Stream, T
+from deworldsg_ros.streams.detections import sent_detections
 from deworldsg_ros.streams.images import (
     depth_from_message,
     instances_from_message,
@@ -23,6 +24,7 @@ from deworldsg_ros.streams.images import (
     rgb_from_message,
 )
 from deworldsg_ros.streams.poses import ClockGate, JumpGate, PoseStream, TransformTree
+from deworldsg_ros.wire.messages import DetectionsMessage, ns_from_stamp
 
 # --- Join depth, camera_info and pose to the items of a leading stream.
 
@@ -35,6 +37,8 @@ TOPICS = {
     "frame_graph": "deworldsg/frame_graph",
     "instances": "deworldsg/instances",
     "local_graph": "deworldsg/local_graph",
+    "detections": "deworldsg/detections",
+    "detection_instances": "deworldsg/detections/instances",
 }
 # Changes of the intrinsics that are remembered: a zoom camera changes them often, and frames that
 # still wait for depth or pose need only the newest.
@@ -308,6 +312,8 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         capacity: maximum number of messages in the buffer of each stream.
         max_wait_s: maximum time that an RGB image waits for the other streams.
         on_drop: called with the reason, a message and the number of items of each drop.
+        with_detections: whether each image waits for the detections of another process; one
+            without is dropped.
 
     Attributes:
         drops: number of dropped items by reason.
@@ -321,32 +327,77 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         capacity: int = 64,
         max_wait_s: float = 2.0,
         on_drop: OnDrop | None = None,
+        with_detections: bool = False,
     ) -> None:
-        super().__init__("rgb", (), inputs, topics, capacity, max_wait_s, on_drop)
+        others = ("detections",) if with_detections else ()
+        super().__init__("rgb", others, inputs, topics, capacity, max_wait_s, on_drop)
         self._gate = JumpGate()
+        self._detections: Stream[DetectionsMessage] | None = self._others.get("detections")
+        # The instance image is optional: images wait for it after the first one.
+        name = "detection_instances"
+        self._instances: Stream[Any] = Stream(name, {**TOPICS, **(topics or {})}[name], capacity)
 
     def add_rgb(self, message: Any, stamp_ns: int) -> None:
         """Keep an RGB image, Image or CompressedImage."""
         self._add(self._leader, stamp_ns, message)
 
+    def add_detections(self, message: DetectionsMessage) -> None:
+        """Keep the detections of an image."""
+        if self._detections is not None:
+            self._add(self._detections, ns_from_stamp(message.stamp), message)
+
+    def add_detection_instances(self, message: Any, stamp_ns: int) -> None:
+        """Keep the instance image of detections: mono16, k + 1 on the pixels of the k-th one."""
+        if self._detections is not None:
+            self._add(self._instances, stamp_ns, message)
+
     def _restart(self, stamp_ns: int) -> None:
         super()._restart(stamp_ns)
+        if self._instances.restarts(stamp_ns):
+            self._instances.clear()
         self._gate = JumpGate()
 
     def _settled(self, stamp_ns: int, value: Any) -> bool:
-        return self._posed(stamp_ns)
+        if self._detections is None:
+            return self._posed(stamp_ns)
+        has_masks = self._instances.newest_ns is None or self._instances.settled(stamp_ns)
+        return self._detections.settled(stamp_ns) and has_masks and self._posed(stamp_ns)
 
     def _build(self, stamp_ns: int, value: Any) -> Callable[[], RgbdFrame]:
         intrinsics = self._intrinsics_at(stamp_ns)
         T_world_camera, frame_id = self._source().at(stamp_ns, self.camera_frame)
         decode_depth = self._depth_at(stamp_ns)
+        decode_sent = self._sent_at(stamp_ns, intrinsics)
         self._gate.check(T_world_camera, stamp_ns)
 
         def decode() -> RgbdFrame:
             depth_m, rgb = decode_depth(), rgb_from_message(value)
-            return RgbdFrame(stamp_ns, rgb, depth_m, intrinsics, T_world_camera, frame_id)
+            sent = None if decode_sent is None else decode_sent()
+            return RgbdFrame(stamp_ns, rgb, depth_m, intrinsics, T_world_camera, frame_id, sent)
 
         return decode
+
+    def _sent_at(
+        self, stamp_ns: int, intrinsics: Intrinsics
+    ) -> Callable[[], SentDetections] | None:
+        """A function that decodes the detections of an image; None = they are not wanted."""
+        if self._detections is None:
+            return None
+        message = self._detections.exact(stamp_ns)
+        masks = None
+        if self._instances.newest_ns is not None:
+            masks = self._instances.exact(stamp_ns)
+
+        def decode() -> SentDetections:
+            instances = None if masks is None else instances_from_message(masks)
+            return sent_detections(message, intrinsics.width, intrinsics.height, instances)
+
+        return decode
+
+    def _forget(self, stamp_ns: int) -> None:
+        super()._forget(stamp_ns)
+        for stream in filter(None, (self._detections, self._instances)):
+            self._drop_unmatched(stream, stream.forget_before(stamp_ns + 1))
 
 
 class LiftingAssembler(PosedAssembler[FrameGraph, LiftingFrame]):

@@ -15,6 +15,7 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.limits import (
     MAX_COORDINATE_M,
     MAX_COST,
+    MAX_EMBEDDING,
     MAX_FOCAL_PX,
     MAX_FRAME_BYTES,
     MAX_GRAPH_BYTES,
@@ -23,6 +24,7 @@ from deworldsg_ros.scene.limits import (
     MAX_INSTANCE,
     MAX_INT,
     MAX_LOGIT,
+    MAX_MASK_BYTES,
     MAX_NAME_CHARACTERS,
     MAX_NAMES,
     MAX_OBJECTS,
@@ -156,6 +158,76 @@ class DetectedObject(msgspec.Struct):
     box_xyxy: Box
     score: Probability
     class_probabilities: Distribution
+
+
+class NameScore(msgspec.Struct):
+    """What an object may be."""
+
+    name: Annotated[
+        str,
+        msgspec.Meta(
+            min_length=1,
+            max_length=MAX_NAME_CHARACTERS,
+            description="free text, also one that was never sent before",
+        ),
+    ]
+    score: Probability
+
+
+class SentMask(msgspec.Struct):
+    """The pixels of an object, as a part of the image."""
+
+    left: Annotated[int, msgspec.Meta(ge=0, lt=MAX_SIDE_PX, description="column of the image")]
+    top: Annotated[int, msgspec.Meta(ge=0, lt=MAX_SIDE_PX, description="row of the image")]
+    width: Side
+    height: Side
+    bits: Annotated[
+        bytes,
+        msgspec.Meta(
+            max_length=MAX_MASK_BYTES,
+            description="a bit a pixel, row by row, the highest bit first (numpy.packbits), base64",
+        ),
+    ]
+
+
+class SentDetection(msgspec.Struct):
+    """One object that a detector of yours has found."""
+
+    box_xyxy: Box
+    hypotheses: Annotated[
+        list[NameScore],
+        msgspec.Meta(
+            min_length=1,
+            max_length=MAX_NAMES,
+            description="names with their scores, in any order, one at least. If the scores sum to "
+            "one, they are the distribution of the class; otherwise the rest is what the detector "
+            "leaves open",
+        ),
+    ]
+    score: Annotated[
+        Union[Probability, msgspec.UnsetType],
+        msgspec.Meta(description="of the object; without it, the highest of its names"),
+    ] = msgspec.UNSET
+    mask: Optional[SentMask] = None
+    embedding: Annotated[
+        bytes,
+        msgspec.Meta(
+            max_length=2 * MAX_EMBEDDING,
+            description="float16 little-endian, base64, as long for all objects; empty = none",
+        ),
+    ] = b""
+
+
+class DetectionsMessage(Message, kw_only=True):
+    """deworldsg/detections: what a detector of yours has found in an image.
+
+    The stamp is that of the image, and frame_id that of the camera.
+    """
+
+    detections: Annotated[list[SentDetection], msgspec.Meta(max_length=MAX_OBJECTS)]
+    embedding_model: Annotated[
+        Name, msgspec.Meta(description="name of the model that made the embeddings")
+    ] = ""
 
 
 class FrameGraphMessage(Message, kw_only=True):
@@ -448,6 +520,7 @@ class SceneGraphUpdateMessage(Message, kw_only=True):
 
 
 MESSAGES: dict[str, type[Message]] = {
+    "detections": DetectionsMessage,
     "frame_graph": FrameGraphMessage,
     "local_graph": LocalGraphMessage,
     "relation_evidence": RelationEvidenceMessage,

@@ -8,7 +8,7 @@ from support.perception import on_image
 
 from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.perception.stage import instance_image, join_nested
-from deworldsg_ros.scene.frame_graph import MaskPatch
+from deworldsg_ros.scene.camera import MaskPatch
 
 SHAPE = (6, 7)
 

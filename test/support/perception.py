@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deworldsg_ros.perception.protocols import SegmentedObjects
-from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import MaskPatch
+from deworldsg_ros.scene.camera import Intrinsics, MaskPatch
 
 WIDTH, HEIGHT = 320, 240
 INTRINSICS = Intrinsics(262.5, 262.5, 159.5, 119.5, WIDTH, HEIGHT)

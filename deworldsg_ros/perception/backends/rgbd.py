@@ -7,8 +7,7 @@ import numpy as np
 from deworldsg_ros.base.kernels import kernel, read_only
 from deworldsg_ros.perception.backends.regions import Regions, find_regions, reduce_frame
 from deworldsg_ros.scene.arrays import Float32, Float64, Int16, Int32, Int64, UInt8
-from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import MaskPatch
+from deworldsg_ros.scene.camera import Intrinsics, MaskPatch
 
 # --- The regions inside each box that belong to its object.
 #

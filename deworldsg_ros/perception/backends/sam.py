@@ -22,8 +22,7 @@ from deworldsg_ros.checkpoints.loading import (
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.backends.image_tensors import Preprocessing, resize
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, UInt8
-from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import MaskPatch
+from deworldsg_ros.scene.camera import Intrinsics, MaskPatch
 
 # --- Common part of SAM and SAM 2: boxes are decoded in batches, logits become masks.
 

@@ -15,6 +15,7 @@ from deworldsg_ros.recordings.source import (
     CAMERA_INFO,
     ODOMETRY,
     POSE_STAMPED,
+    STRING,
     TF_MESSAGE,
     RawRoleMessage,
     Role,
@@ -25,19 +26,22 @@ from deworldsg_ros.recordings.source import (
     pose_stamped_from_matrix,
     serialize,
     stamp_ns_of_cdr,
+    string_message,
 )
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RecordingError, RefusedInput
+from deworldsg_ros.streams.detections import read_detections
 from deworldsg_ros.streams.images import depth_from_message, rgb_from_message
 from deworldsg_ros.streams.poses import TransformTree, pose_from_message
+from deworldsg_ros.wire.messages import encode, ns_from_stamp
 
 # Static transforms: also /robot/tf_static.
 STATIC_SUFFIX = "tf_static"
 
 
 class BagSource:
-    """Messages of the four roles of a bag; see `Source`.
+    """Messages of the roles of a bag; see `Source`.
 
     With poses from TF, each RGB image gets a PoseStamped of its frame. An Odometry of another frame
     is transformed to the RGB frame with /tf_static.
@@ -94,6 +98,9 @@ class BagSource:
             odometry = found[Role.POSE]
             self.topics[Role.POSE] = UsedTopic(odometry.name, POSE_STAMPED, odometry.count)
         self.frame_count = found[Role.RGB].count
+        if Role.DETECTIONS in found:
+            sent = found[Role.DETECTIONS]
+            self.topics[Role.DETECTIONS] = UsedTopic(sent.name, STRING, sent.count)
         if self._intrinsics is not None:
             self.topics[Role.CAMERA_INFO] = UsedTopic("--intrinsics", CAMERA_INFO, self.frame_count)
 
@@ -105,6 +112,13 @@ class BagSource:
         if Role.POSE in self._found and self._found[Role.POSE].msgtype == TF_MESSAGE:
             del roles[self._found[Role.POSE].key]
             poses = _TfPoses(self._bag, self._inputs)
+        # A detector sends its results after the image, and a frame needs both: so they are read
+        # ahead, and come before it.
+        ahead = [
+            _Ahead(self._bag, roles.pop(self._found[role].key), self._found[role], self.drops)
+            for role in (Role.DETECTIONS, Role.DETECTION_INSTANCES)
+            if role in self._found
+        ]
         for raw in self._bag.messages(roles):
             role = roles[raw.topic, raw.msgtype]
             try:
@@ -114,6 +128,9 @@ class BagSource:
             except Exception:  # rosbags raises errors of many types
                 self.drops["invalid_message"] += 1
                 continue
+            if role is Role.RGB:
+                for stream in ahead:
+                    yield from stream.up_to(stamp_ns, raw.log_time_ns)
             if role is Role.RGB and self._intrinsics is not None:
                 yield serialize(camera_info(stamp_ns, frame_id, self._intrinsics), raw.log_time_ns)
             if role is Role.RGB and poses is not None:
@@ -211,6 +228,45 @@ class BagSource:
         for raw in self._bag.messages([topic.key]):
             with contextlib.suppress(Exception):  # rosbags raises errors of many types
                 return decode(raw.data, raw.msgtype)
+        return None
+
+
+class _Ahead:
+    """The detections of a bag, or their instance images, as messages that come with the image.
+
+    Detections of vision_msgs become our JSON: the nodes need no package for them then.
+    """
+
+    def __init__(self, bag: RawBag, role: Role, topic: Topic, drops: Counter[str]) -> None:
+        self._role, self._drops = role, drops
+        self._messages = bag.messages([topic.key])
+        self._next: RoleMessage | None = None
+
+    def up_to(self, stamp_ns: int, log_time_ns: int) -> Iterator[RawRoleMessage]:
+        """The next messages with a stamp up to this one, at that time of recording."""
+        while True:
+            if self._next is None:
+                self._next = self._read()
+            if self._next is None or self._next.stamp_ns > stamp_ns:
+                return
+            yield serialize(self._next, log_time_ns)
+            self._next = None
+
+    def _read(self) -> RoleMessage | None:
+        """The next message that can be read; None at the end."""
+        for raw in self._messages:
+            try:
+                message = decode(raw.data, raw.msgtype)
+                if self._role is not Role.DETECTIONS:
+                    return RoleMessage(self._role, raw.msgtype, stamp_ns_of_cdr(raw.data), message)
+                sent = read_detections(message)
+            except RefusedInput as refusal:
+                self._drops[refusal.reason] += 1
+                continue
+            except Exception:  # rosbags raises errors of many types
+                self._drops["invalid_message"] += 1
+                continue
+            return string_message(self._role, ns_from_stamp(sent.stamp), encode(sent))
         return None
 
 

@@ -10,9 +10,11 @@ from deworldsg_ros.recordings.bags.storage import Topic
 from deworldsg_ros.recordings.source import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
+    DETECTIONS,
     IMAGE,
     ODOMETRY,
     POSE_STAMPED,
+    STRING,
     TF_MESSAGE,
     Role,
 )
@@ -38,6 +40,8 @@ TYPES = {
     Role.DEPTH: IMAGES,
     Role.CAMERA_INFO: (CAMERA_INFO,),
     Role.POSE: POSES,
+    Role.DETECTIONS: (STRING, DETECTIONS),
+    Role.DETECTION_INSTANCES: (IMAGE,),
 }
 TRANSPORTS: dict[str, Types] = {
     "auto": IMAGES,
@@ -55,7 +59,10 @@ EXPECTED = {
     Role.DEPTH: "an Image or CompressedImage with depth in its name",
     Role.CAMERA_INFO: "a CameraInfo beside the RGB image (or use --intrinsics FX,FY,CX,CY)",
     Role.POSE: "a PoseStamped, an Odometry or /tf (or use --odometry, or run with --poses FILE)",
+    Role.DETECTIONS: "a Detection2DArray, or a String of ours with detections in its name",
 }
+# The instance image of detections has their topic, and this.
+INSTANCES_SUFFIX = "/instances"
 
 
 @dataclass(frozen=True)
@@ -66,10 +73,11 @@ class TopicChoice:
     depth: str = ""
     camera_info: str = ""
     pose: str = ""
+    detections: str = ""
 
 
 def parse_topics(text: str) -> TopicChoice:
-    """Topics of ``rgb=/a,depth=/b,camera_info=/c,pose=/d``; each role at most once, any left out.
+    """Topics of ``rgb=/a,depth=/b,pose=/c``; each role of `TopicChoice` at most once.
 
     Raises:
         RecordingError: for an unknown role, a role given twice, or a part without a topic.
@@ -79,8 +87,8 @@ def parse_topics(text: str) -> TopicChoice:
         role, _, topic = (word.strip() for word in part.partition("="))
         if role not in TopicChoice.__dataclass_fields__ or role in chosen or not topic:
             raise RecordingError(
-                f"topics '{text}': cannot read '{part}', expected each of rgb, depth, camera_info "
-                "and pose at most once, as rgb=/a,depth=/b,camera_info=/c,pose=/d"
+                f"topics '{text}': cannot read '{part}', expected each of rgb, depth, camera_info, "
+                "pose and detections at most once, as rgb=/a,depth=/b,camera_info=/c,pose=/d"
             )
         chosen[role] = topic
     return TopicChoice(**chosen)
@@ -131,6 +139,15 @@ def find_topics(
     posed = any(topic.msgtype in types and _pose_score(topic) is not None for topic in filled)
     if need_pose or posed or choice.pose:
         found[Role.POSE] = find(Role.POSE, choice.pose, types, _pose_score)
+    sent = TYPES[Role.DETECTIONS]
+    if choice.detections or any(
+        topic.msgtype in sent and _detections_score(topic) is not None for topic in filled
+    ):
+        topic = find(Role.DETECTIONS, choice.detections, sent, _detections_score)
+        found[Role.DETECTIONS] = topic
+        for masks in filled:
+            if (masks.name, masks.msgtype) == (topic.name + INSTANCES_SUFFIX, IMAGE):
+                found[Role.DETECTION_INSTANCES] = masks
     return found
 
 
@@ -201,3 +218,9 @@ def _pose_score(topic: Topic) -> tuple[float, ...] | None:
         return None
     rank = -POSES.index(topic.msgtype)
     return (rank, "camera" in name, "pose" in name, topic.count)
+
+
+def _detections_score(topic: Topic) -> tuple[float, ...] | None:
+    if topic.msgtype == STRING and not topic.name.lower().endswith("detections"):
+        return None
+    return (topic.msgtype == STRING, topic.count)
