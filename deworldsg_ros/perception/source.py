@@ -16,8 +16,8 @@ from deworldsg_ros.scene.camera import SentDetections
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.vocabulary import plain
 
-# Scores of detectors differ; most publish what is above 0.25 to 0.5.
-SCORE_THRESHOLD = 0.3
+# As the embedded detector. Scores of detectors differ: `perception.score_threshold` replaces it.
+SCORE_THRESHOLD = 0.4
 # Names that a source may bring. A source that numbers its objects would bring ever new ones, and
 # each costs eight bytes a node.
 MAX_SOURCE_NAMES = 2048
