@@ -5,7 +5,9 @@
 
 Starts the real node processes on this machine and publishes the shipped recording to them: raw
 640x480 images at a fixed rate, forwards and backwards, with the present time as stamps. With the
-front end `recorded`, segmentation_node returns the results that its perception gave before.
+front end `recorded`, segmentation_node returns the results that its perception gave before. With
+`sent`, 20 boxes an image arrive as JSON at the time of the image, as from a detector elsewhere
+(`perception.detector: topic`); those that are not objects stand for a detector that finds more.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from bench.figures import Figure, Setup
@@ -47,6 +50,7 @@ NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 START_LIMIT_S = 120.0
 # The first seconds, in which nodes find each other and caches fill, are not measured.
 WARM_UP_S = 3.0
+SENT_BOXES = 20
 # After the last image: longer than the latency of any frame.
 DRAIN_S = 2.0
 # A message of these streams that is lost is a frame that is lost.
@@ -136,10 +140,11 @@ def fingerprint(rgb: np.ndarray) -> int:
 class Camera:
     """Publishes frames with new stamps, as serialized messages."""
 
-    def __init__(self, node: Any, frames: Sequence[RgbdFrame]) -> None:
+    def __init__(self, node: Any, frames: Sequence[RgbdFrame], *, sends: bool = False) -> None:
         from geometry_msgs.msg import PoseStamped
         from rclpy.serialization import serialize_message
         from sensor_msgs.msg import CameraInfo, Image
+        from std_msgs.msg import String
 
         from deworldsg_ros.nodes.odometry_node import put_pose
         from deworldsg_ros.ros.qos import reliable
@@ -167,6 +172,11 @@ class Camera:
             fill_image(depth, np.round(1e3 * frame.depth_m).astype(np.uint16), "16UC1")
             fill_image(rgb, np.ascontiguousarray(frame.rgb), "rgb8")
             self._frames.append([serialize_message(item) for item in (pose, info, depth, rgb)])
+        self._sent = boxes_of(frames) if sends else []
+        self._text = String
+        if sends:
+            topic = "deworldsg/detections"
+            self._detections = node.create_publisher(String, topic, reliable(10))
 
     @property
     def listeners(self) -> int:
@@ -181,6 +191,29 @@ class Camera:
         stamp = struct.pack("<iI", *divmod(stamp_ns, 10**9))
         for output, data in zip(self._outputs, self._frames[min(at, period - at)]):
             output.publish(data[:4] + stamp + data[12:])
+        if self._sent:
+            message = self._sent[min(at, period - at)]
+            message.stamp = wire.stamp_from_ns(stamp_ns)
+            self._detections.publish(self._text(data=wire.encode(message)))
+
+
+def boxes_of(frames: Sequence[RgbdFrame]) -> list[wire.DetectionsMessage]:
+    """The `SENT_BOXES` best boxes of each frame, with names and scores above the threshold."""
+    perception = build_perception(msgspec.structs.replace(Config().perception, score_threshold=0.0))
+    messages = []
+    for frame in frames:
+        found = perception.detect(perception.turn_upright(frame).upright).take(slice(SENT_BOXES))
+        best = found.class_probabilities.argmax(axis=1)
+        items = [
+            wire.SentDetection(
+                box, [wire.NameScore(perception.vocabulary.classes[label], max(0.5, score))]
+            )
+            for box, label, score in zip(found.boxes_xyxy.tolist(), best, found.scores.tolist())
+        ]
+        head = wire.schema_of(wire.DetectionsMessage), wire.Stamp(0, 0), "camera"
+        fields = dict(zip(("schema", "stamp", "frame_id"), head))
+        messages.append(wire.DetectionsMessage(**fields, detections=items))
+    return messages
 
 
 class Listener:
@@ -250,7 +283,11 @@ def run_node(name: str, recorded: str, marks: str, *arguments: str) -> int:
 
 @contextmanager
 def _running(
-    nodes: Sequence[str], recorded: Path | None, folder: Path, steps: bool
+    nodes: Sequence[str],
+    recorded: Path | None,
+    folder: Path,
+    steps: bool,
+    arguments: Sequence[str] = (),
 ) -> Iterator[list[LoggedProcess]]:
     """The processes of the nodes, once all are ready."""
     processes: list[LoggedProcess] = []
@@ -259,12 +296,13 @@ def _running(
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
     try:
         for name in nodes:
-            command = [sys.executable, "-m", f"deworldsg_ros.nodes.{name}"]
+            command = [sys.executable, "-m", f"deworldsg_ros.nodes.{name}", *arguments]
             perceives = name in ("segmentation_node", "deworldsg_node")
             if steps or (recorded and perceives):
                 replayed = str(recorded) if recorded and perceives else ""
                 marks = str(folder / f"{name}.marks") if steps else ""
                 command = [sys.executable, "-m", "bench.latency", "--node", name, replayed, marks]
+                command += arguments
             log = folder / f"{name}.log"
             processes.append(LoggedProcess(name, command, environment, log))
         end_s = time.monotonic() + START_LIMIT_S
@@ -312,7 +350,7 @@ def measure(
     Args:
         seconds: of measured frames, after `WARM_UP_S` of others.
         rate_hz: of the camera.
-        front_end: recorded or embedded.
+        front_end: recorded, embedded or sent.
         one_process: deworldsg_node in place of the four nodes.
         steps: also measure each step between the stamp and the update.
         max_frames: distinct frames of the recording; None = all.
@@ -333,7 +371,11 @@ def measure(
         node = rclpy.create_node("latency_bench", context=context)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(node)
-        camera, listener = Camera(node, frames), Listener(node)
+        camera = Camera(node, frames, sends=front_end == "sent")
+        listener = Listener(node)
+        arguments = (
+            ["--ros-args", "-p", "perception.detector:=topic"] if front_end == "sent" else []
+        )
         stop = threading.Event()
 
         def spin() -> None:
@@ -342,7 +384,7 @@ def measure(
 
         thread = threading.Thread(target=spin)
         try:
-            with _running(nodes, recorded, Path(folder), steps) as processes:
+            with _running(nodes, recorded, Path(folder), steps, arguments) as processes:
                 thread.start()
                 _wait_for_listeners(camera, 1 if one_process else 2)
                 warm = _play(camera, rate_hz, WARM_UP_S)
@@ -387,6 +429,7 @@ def figures(setup: Setup) -> list[Figure]:
     found: list[Figure] = []
     cases = (
         ("recorded", False, 25.0, 60.0),
+        ("sent", False, 50.0, None),
         ("embedded", False, 90.0, None),
         ("embedded", True, None, None),
     )
@@ -442,7 +485,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate", type=float, default=30.0, help="of the camera, Hz")
-    parser.add_argument("--front-end", choices=("recorded", "embedded"), default="recorded")
+    parser.add_argument("--front-end", choices=("recorded", "embedded", "sent"), default="recorded")
     parser.add_argument("--one-process", action="store_true", help="deworldsg_node")
     parser.add_argument("--steps", action="store_true", help="also each step in between")
     options = parser.parse_args()

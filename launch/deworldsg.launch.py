@@ -32,6 +32,11 @@ INPUTS = (
     ("camera_info", "rgb/camera_info", "intrinsics of the colour camera"),
     ("depth", "depth/image_raw", "depth images, registered to the colour images"),
     ("pose", "camera/pose", "poses of the colour camera's optical frame (PoseStamped, Odometry)"),
+    (
+        "detections",
+        "deworldsg/detections",
+        "detections of another process, if perception.detector is topic",
+    ),
 )
 
 

@@ -72,13 +72,14 @@ def test_nodes_have_the_parameter_file_remappings_conditions_and_respawn(root_di
             "rgb/camera_info": "camera_info",
             "depth/image_raw": "depth",
             "camera/pose": "pose",
+            "deworldsg/detections": "detections",
         }
         assert node.kwargs["respawn"].args == ("respawn",)
     variables = dict(entity.args for entity in found["SetEnvironmentVariable"])
     assert variables[RESPAWN_VARIABLE].args == ("respawn",)
     assert {entity.args[0] for entity in found["DeclareLaunchArgument"]} == {
         *("params_file", "use_sim_time", "namespace", "odometry", "one_process", "respawn"),
-        *("rgb", "camera_info", "depth", "pose"),
+        *("rgb", "camera_info", "depth", "pose", "detections"),
     }
 
 
