@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """A detector in a process of its own, as in docs/your_own_detector.md.
 
-    python tools/example_detector.py [--ros-args -r rgb/image_raw/compressed:=YOUR_TOPIC]
+python tools/example_detector.py [--ros-args -r rgb/image_raw/compressed:=YOUR_TOPIC]
 """
 
 import json
