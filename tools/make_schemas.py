@@ -69,7 +69,12 @@ def _frame_examples() -> dict[str, wire.Message]:
                     mask=wire.SentMask(312, 182, 4, 3, bytes([0b01101111, 0b11110000])),
                     embedding=struct.pack("<4e", 0.5, -0.25, 0.0, 1.0),
                 ),
-                wire.SentDetection([120.0, 215.0, 560.0, 402.5], [wire.NameScore("desk", 0.83)]),
+                wire.SentDetection(
+                    box_xyxy=[120.0, 215.0, 560.0, 402.5],
+                    hypotheses=[wire.NameScore("desk", 0.83)],
+                    mask=wire.SentMask(120, 216, 2, 2, bytes([0b11010000])),
+                    embedding=struct.pack("<4e", 0.0, 1.0, 0.5, 0.25),
+                ),
             ],
             embedding_model="openai/clip-vit-base-patch32",
         ),

@@ -208,7 +208,9 @@ class SentDetection(msgspec.Struct):
         Union[Probability, msgspec.UnsetType],
         msgspec.Meta(description="of the object; without it, the highest of its names"),
     ] = msgspec.UNSET
-    mask: Optional[SentMask] = None
+    mask: Annotated[
+        Optional[SentMask], msgspec.Meta(description="of all objects of a message, or of none")
+    ] = None
     embedding: Annotated[
         bytes,
         msgspec.Meta(

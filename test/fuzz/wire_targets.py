@@ -27,9 +27,11 @@ from deworldsg_ros.client.questions import ask
 from deworldsg_ros.config import Config, MergingConfig, RelationsConfig
 from deworldsg_ros.fleet.fleet import Fleet
 from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.perception.source import DetectionSource
 from deworldsg_ros.relations.clips import PublishedGraph
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, RelationEvidence
+from deworldsg_ros.streams.detections import sent_detections
 from deworldsg_ros.view import picture
 from deworldsg_ros.view.colours import view_axes
 from deworldsg_ros.view.live.state import LiveState
@@ -77,6 +79,19 @@ def _check_objects(graph: FrameGraph | LocalGraph) -> None:
     rows, boxes = graph.class_probabilities, graph.boxes_xyxy
     assert (rows >= 0).all() and np.allclose(rows.sum(axis=1), 1.0, atol=1e-4)
     assert (boxes[:, :2] <= boxes[:, 2:]).all()
+
+
+def _use_detections(message: wire.DetectionsMessage) -> None:
+    sent = sent_detections(message, 640, 480)
+    source = DetectionSource()
+    for _ in range(2):  # the second time, it compares
+        found = source.take(sent, 0.0)
+        assert len(found) <= len(sent) and len(found.classes or ()) >= 1
+        sums = found.class_probabilities.sum(axis=1)
+        assert (found.class_probabilities >= 0).all() and np.allclose(sums, 1.0)
+        for mask in found.masks or ():
+            height, width = mask.pixels.shape
+            assert mask.top + height <= 480 and mask.left + width <= 640
 
 
 def _use_frame_graph(message: wire.FrameGraphMessage) -> None:
@@ -209,6 +224,7 @@ def _use_hostile_graph(rng: np.random.Generator, folder: Path) -> None:
 
 
 TARGETS: list[Target] = [
+    _message("detections", _use_detections),
     _message("frame_graph", _use_frame_graph),
     _message("local_graph", _use_local_graph),
     _message("relation_evidence", _use_evidence),

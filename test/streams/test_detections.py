@@ -37,6 +37,12 @@ def test_json_and_vision_msgs_say_the_same():
         assert got.name_scores == ((0.6, 0.3), (0.9,))
 
 
+def test_the_example_of_the_schema_is_read(root_dir):
+    text = (root_dir / "msg_schemas" / "detections.example.json").read_text()
+    sent = sent_detections(wire.decode(text, wire.DetectionsMessage), 640, 480)
+    assert sent.names[0] == ("red mug", "cup") and len(sent.masks) == len(sent.embeddings) == 2
+
+
 def test_a_turned_box_becomes_the_upright_one_around_it():
     (item,) = read_detections(vision_message(NAMED[:1], theta=math.pi / 2)).detections
     assert np.allclose(item.box_xyxy, [2.5, 0.5, 5.5, 4.5])
