@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,172 +14,173 @@ from deworldsg_ros.scene.arrays import Float64, Int64
 
 # --- The class of a node: a hidden Markov model, because wrong names come in spells.
 #
-# A detector that calls a chair a bag calls it so for as long as it sees it from there. So the model
-# of a node has two labels: the class of the object, and the name that it has at present. The name
-# is drawn again with a time constant of SPELL_S seconds: it is the class, or another label with
-# probability WRONG. A frame shows the name, or any label with probability OUTLIERS. Only the LABELS
-# most probable labels are considered. The constants gave the most relations with faults of all
-# kinds in one room, and no fewer with the detector (tools/merging_lab).
+# A detector that calls a chair a bag calls it so for as long as it sees it from there, and often a
+# little further. So the model of a node has two labels: the class of the object, and the name that
+# it has at present. At a new viewpoint the name is drawn again with probability DRAWN: it is the
+# class, or another label with probability WRONG. A frame shows the name, or any label with
+# probability OUTLIERS. A viewpoint that the camera comes back to has said its name. Only the LABELS
+# most probable labels count. The constants gave the most relations with faults of all kinds in one
+# room, and no fewer with the detector (tools/merging_lab).
 
 LABELS = 8
-SPELL_S = 3.0
+DRAWN = 0.25
 WRONG = 0.4
 OUTLIERS = 0.4
 # Probability of all other labels together.
 OTHERS = 0.05
 
-# The part of a node's record that belongs to its name: the labels (-1 = none), and the probability
-# of each class (row) with each name (column).
+# The part of a node's record that belongs to its name: the labels (-1 = none), the probability
+# of each class (row) with each name (column), and the place of the viewpoint of the name.
 NAME_FIELDS: list[Any] = [
     ("labels", np.int64, LABELS),
     ("joint", np.float64, (LABELS, LABELS)),
-    ("named_ns", np.int64),
+    ("named_from", np.int64),
 ]
 
 
-@kernel
-def start(record: Any, probabilities: Float64, stamp_ns: int) -> None:
+def start(record: Any, probabilities: Float64) -> None:
     """Begin with class probabilities (C,)."""
-    order = np.argsort(-probabilities)
-    count = min(LABELS, len(order))
-    for i in range(LABELS):
-        record.labels[i] = order[i] if i < count else -1
-        for j in range(LABELS):
-            share = 1.0 - WRONG if i == j else WRONG / max(count - 1, 1)
-            both = i < count and j < count
-            record.joint[i, j] = share * probabilities[order[j]] if both else 0.0
-    record.named_ns = stamp_ns
+    order = np.argsort(-probabilities, kind="stable")[:LABELS]
+    count = len(order)
+    drawn = np.full((count, count), WRONG / max(count - 1, 1))
+    np.fill_diagonal(drawn, 1.0 - WRONG)
+    record["labels"], record["joint"], record["named_from"] = -1, 0.0, 0
+    record["labels"][:count] = order
+    record["joint"][:count, :count] = drawn * probabilities[order]
 
 
 @kernel
 def observe_names(
-    records: NDArray[Any], slots: Int64, seen: Float64, stamp_ns: int, classes: Float64
+    records: NDArray[Any],
+    slots: Int64,
+    seen: Float64,
+    means_world: Float64,
+    camera_world: Float64,
+    classes: Float64,
 ) -> None:
     """Add class distributions (n, C) of a frame to n known nodes.
 
     Args:
-        records: with `NAME_FIELDS`; those of the slots are updated.
+        records: with `NAME_FIELDS` and `EXISTENCE_FIELDS`; those of the slots are updated.
         slots: (n,) index of each node's record.
         seen: (n, C) distributions of the detections.
-        stamp_ns: of the frame.
+        means_world: (n, 3) means of the nodes, metres.
+        camera_world: (3,) position of the camera, metres.
         classes: (n, C), filled with the distributions of the nodes' classes.
     """
     for index in range(len(slots)):
         record = records[slots[index]]
-        _consider(record, int(np.argmax(seen[index])))
-        known = 0
-        for label in record.labels:
-            known += int(label >= 0)
-        leave = 1.0 - np.exp(-max(stamp_ns - record.named_ns, 0) * 1e-9 / SPELL_S)
-        record.named_ns = stamp_ns
-        total = 0.0
-        for i in range(known):
-            belief = record.joint[i].sum()
-            for j in range(known):
-                drawn = 1.0 - WRONG if i == j else WRONG / max(known - 1, 1)
-                shown = (1.0 - OUTLIERS) * seen[index, record.labels[j]]
-                shown += OUTLIERS / seen.shape[1]
-                moved = (1.0 - leave) * record.joint[i, j] + leave * drawn * belief
-                record.joint[i, j] = moved * shown
-                total += record.joint[i, j]
+        place = viewpoint(record, means_world[index], camera_world)
+        is_new = place < 0 or record.view_named[place] == 0
+        if place < 0:
+            place = record.views % VIEWS  # where `observe_existence` puts it
+        if is_new or place == record.named_from:
+            _name(record, seen[index], is_new)
+            record.named_from = place
         classes[index] = OTHERS / seen.shape[1]
-        for i in range(known):
-            record.joint[i] /= total
-            classes[index, record.labels[i]] += (1.0 - OTHERS) * record.joint[i].sum()
+        for i in range(LABELS):
+            if record.labels[i] >= 0:
+                classes[index, record.labels[i]] += (1.0 - OTHERS) * record.joint[i].sum()
 
 
 @kernel
-def _consider(record: Any, label: int) -> None:
-    """Make sure that a label is considered; it takes the place of the least probable one."""
-    place = 0
+def _name(record: Any, seen: Float64, is_new: bool) -> None:
+    """Add the distribution (C,) of a frame, from a new viewpoint or the same as before."""
+    # The best label is considered: it takes a free place, or that of the least probable one.
+    label, place, is_known = int(np.argmax(seen)), 0, False
     for i in range(LABELS):
-        if record.labels[i] == label:
-            return
+        is_known |= record.labels[i] == label
+    for i in range(0 if is_known else LABELS):
         if record.labels[i] < 0 or record.joint[i].sum() < record.joint[place].sum():
             place = i
             if record.labels[i] < 0:
                 break
-    record.labels[place] = label
-    for i in range(LABELS):
-        record.joint[i, place] = 0.0
-    # If the object is this, all names so far were wrong.
-    for j in range(LABELS):
-        others = 0.0
-        for i in range(LABELS):
-            others += record.joint[i, j] if i != place else 0.0
-        record.joint[place, j] = WRONG / LABELS * others
+    if not is_known:
+        record.labels[place] = label
+        record.joint[:, place] = 0.0
+        # If the object is this, all names so far were wrong.
+        for j in range(LABELS):
+            others = record.joint[:, j].sum() - record.joint[place, j]
+            record.joint[place, j] = WRONG / LABELS * others
+    known = 0
+    for label in record.labels:
+        known += int(label >= 0)
+    total = 0.0
+    for i in range(known):
+        belief = record.joint[i].sum()
+        for j in range(known):
+            drawn = 1.0 - WRONG if i == j else WRONG / max(known - 1, 1)
+            shown = (1.0 - OUTLIERS) * seen[record.labels[j]] + OUTLIERS / len(seen)
+            if is_new:
+                record.joint[i, j] = (1.0 - DRAWN) * record.joint[i, j] + DRAWN * drawn * belief
+            record.joint[i, j] *= shown
+            total += record.joint[i, j]
+    for i in range(known):
+        record.joint[i] /= total
 
 
-# --- The probability that a node is an object, from the looks at it.
+# --- The probability that a node is an object, from the viewpoints at it.
 #
-# The frames of one camera position show one picture: the errors of a detector in them are one
-# error. So looks are counted instead of frames. A look at a node ends when the camera has moved by
-# LOOK_RAD as seen from the node, or after LOOK_NS. It detects the node by the fraction of its
-# frames that do; frames in which the node is hidden or out of view do not count.
+# The frames of one viewpoint show one picture: the errors of a detector in them are one error. So
+# viewpoints are counted, and neither frames nor seconds. A viewpoint is a direction from the node
+# to the camera within VIEW_RAD, and a distance within a factor of VIEW_RATIO. It detects the node
+# by the fraction of its frames that do; frames in which the node is hidden do not count.
 #
 # The log odds of existence are a sum:
 #
 #     prior + SCORE ln(s / (1 - s)) + LOOKS ln(D) - MISSES ln(1 + M) - MOMENT ln(1 + R)
 #
-# s is the best detection score. D is the sum of the detected fractions of all looks. M is the
-# evidence of the misses: the sum of -(1 - fraction) ln(1 - rate). The rate is the fraction of looks
-# that detect an object; the rule learns one rate for each visibility. R is the part of M since the
-# last detection. R counts only if all detections lie within MOMENT_NS, because a reflection or a
-# shadow lasts for a moment. The prior is learned, too: where many nodes turned out to be errors, a
-# new one is less probable (`prior`).
+# s is the best detection score. D is the sum of min(1, fraction / rate) over all viewpoints: a
+# viewpoint counts as one if it detects the node as often as it would detect an object. The rate is
+# the fraction of frames that detect an object; the rule learns one for each visibility. M is the
+# evidence of the misses: the sum of -(1 - fraction) ln(1 - rate). R is the part of M since the last
+# detection. It counts only if no more than MOMENT_VIEWS have detected the node: a reflection or a
+# false box lasts for a moment. The prior is learned, too: where many nodes turned out to be errors,
+# a new one is less probable (`prior`).
 #
-# The weights started from a logistic regression on recorded and embedded detections of one rendered
-# room and the shipped recording, and were rounded so that a score above 0.5 and a moment in sight
-# count the same for all detectors. docs/dev/notebook.md has the calibration.
+# A new node may have been overlooked: frames before that had its place in view from the same
+# viewpoint belong to this viewpoint, too.
 
 OFFSET, SCORE, LOOKS, MISSES, MOMENT = 0.2, 1.5, 1.2, 0.35, 1.2
+MOMENT_VIEWS = 2
 FATES = 0.4
 # The fate of a node is known from this probability on, or below one minus it after a clear miss.
 # At first, as many objects as errors are known.
 SETTLED, CLEAR_MISS, PRIOR_FATES = 0.9, 1.0, 10
 # Bounds of the score. False boxes may have high scores: above 0.5, a score says no more.
 MIN_SCORE, MAX_SCORE = 0.02, 0.5
-# A look and a false box last about half a second (evaluation/injection.py); the angle is
-# chosen, not measured.
-LOOK_RAD = math.radians(2.0)
-LOOK_NS = 500_000_000
-MOMENT_NS = 1_000_000_000
-# Weight of a frame after a pause: it shows more that is new. At equal weights, nodes of one look
-# were true in 90 % of the cases with every tenth frame of the recording, and in 15 to 30 % in video
-# with false boxes.
-MAX_WEIGHT = 2.0
-# Stamps of earlier runs move no further into the past, however often the clock is set back: only
-# MOMENT_NS of it counts.
-OLDEST_NS = -(2**31) * 10**9
-# The camera stands still if it moves less than this. A look that only time has ended shows the same
-# picture: it counts as this fraction of a look.
-STILL_M = 0.001
-STILL_WEIGHT = 0.25
+VIEW_RAD = math.radians(8.0)
+VIEW_COS = math.cos(VIEW_RAD)
+VIEW_RATIO = 1.2
+# Viewpoints of a node that are remembered. Of more, the oldest one counts for good.
+VIEWS = 12
 # Beyond the largest distance of a detection, by this factor, a miss is not counted.
 REACH_FACTOR = 1.1
-# The rates start as if this many looks had been observed, and half of them had detected the object.
+# The rates start as if this many viewpoints had been observed, and half of them had detected the
+# object.
 PRIOR_LOOKS = 10.0
 
 # The part of a node's record that belongs to its existence.
 EXISTENCE_FIELDS: list[Any] = [
     ("best_score", np.float64),
-    # D, M and R of the looks that have ended.
+    # The largest distance of a detection.
+    ("reach_m", np.float64),
+    # Frames that could have detected it from its first viewpoint, before it was there.
+    ("before", np.float64),
+    # Number of viewpoints so far, and D and M of those that are remembered no more.
+    ("views", np.int64),
     ("looks", np.float64),
     ("missed", np.float64),
-    ("missed_since", np.float64),
-    # First and last detection, and the largest distance of one.
-    ("first_ns", np.int64),
-    ("last_ns", np.int64),
-    ("reach_m", np.float64),
-    # The present look: position and start, frames that detected the node and all frames that show
-    # it, its best visibility, and its weight.
-    ("camera_world", np.float64, 3),
-    ("look_ns", np.int64),
-    ("detected", np.float64),
-    ("shown", np.float64),
-    ("visibility", np.int64),
-    ("look_weight", np.float64),
-    # Looks since the last detection, by visibility.
+    # Viewpoints: position of the camera, frames that show the node and that detected it, its best
+    # visibility, and whether it has said a name.
+    ("view_camera", np.float32, (VIEWS, 3)),
+    ("view_shown", np.float32, VIEWS),
+    ("view_detected", np.float32, VIEWS),
+    ("view_visibility", np.int8, VIEWS),
+    ("view_named", np.int8, VIEWS),
+    # The viewpoint of the last frame that shows it, and the viewpoints since the last detection, by
+    # visibility: misses count for the rates if a detection follows.
+    ("current", np.int64),
     ("pending", np.float64, len(VISIBILITIES)),
     # Whether its fate is known: it is an object, or an error.
     ("is_settled", np.bool_),
@@ -187,7 +188,7 @@ EXISTENCE_FIELDS: list[Any] = [
 
 
 def first_counts() -> Float64:
-    """Looks at objects, and those that detected them, by visibility: (len(VISIBILITIES), 2)."""
+    """Viewpoints at objects, and those that detected them, by visibility: (.., 2)."""
     return np.full((len(VISIBILITIES), 2), (PRIOR_LOOKS, PRIOR_LOOKS / 2))
 
 
@@ -206,32 +207,36 @@ def settle(records: NDArray[Any], fates: Int64, slots: Int64, known: Float64) ->
 
     A node is an error only after a clear miss. A new node is improbable, too, if frames come fast.
     """
-    is_error = (known < 1.0 - SETTLED) & (records["missed_since"][slots] > CLEAR_MISS)
+    is_error = (known < 1.0 - SETTLED) & (records["missed"][slots] > CLEAR_MISS)
     is_new = ~records["is_settled"][slots] & ((known > SETTLED) | is_error)
     records["is_settled"][slots[is_new]] = True
     fates += np.bincount(~is_error[is_new], minlength=2)
 
 
-def frame_weight(step_ns: int | None) -> float:
-    """Part of a look that a frame is worth, by the time since the frame before (None = the first).
+def is_same_view(mean: Float64, camera: Float64, other: Float64) -> bool:
+    """Whether two camera positions (3,) are one viewpoint of a node with this mean, metres."""
+    a, b = camera - mean, other - mean
+    length_a, length_b = math.sqrt(a @ a) + 1e-9, math.sqrt(b @ b) + 1e-9
+    near = length_a < VIEW_RATIO * length_b and length_b < VIEW_RATIO * length_a
+    return bool(near and a @ b > VIEW_COS * length_a * length_b)
 
-    An error of a detector lasts for a moment. So frames at a high rate are worth less.
-    """
-    return MAX_WEIGHT if step_ns is None else min(MAX_WEIGHT, max(step_ns, 1) / LOOK_NS)
 
-
-class Frame(NamedTuple):
-    """A frame as its looks need it.
-
-    Attributes:
-        camera_world: (3,) position of the camera, metres.
-        stamp_ns: of the frame.
-        weight: see `frame_weight`.
-    """
-
-    camera_world: Float64
-    stamp_ns: int
-    weight: float
+@kernel
+def viewpoint(record: Any, mean: Float64, camera: Float64) -> int:
+    """The place of the viewpoint of a camera position; -1 = none of those remembered."""
+    x, y, z = camera[0] - mean[0], camera[1] - mean[1], camera[2] - mean[2]
+    distance = math.sqrt(x * x + y * y + z * z) + 1e-9
+    best, place = VIEW_COS, -1
+    for index in range(min(record.views, VIEWS)):
+        a = record.view_camera[index, 0] - mean[0]
+        b = record.view_camera[index, 1] - mean[1]
+        c = record.view_camera[index, 2] - mean[2]
+        other = math.sqrt(a * a + b * b + c * c) + 1e-9
+        cosine = (x * a + y * b + z * c) / (distance * other)
+        near = distance < VIEW_RATIO * other and other < VIEW_RATIO * distance
+        if near and cosine > best:
+            best, place = cosine, index
+    return place
 
 
 @kernel
@@ -242,9 +247,9 @@ def observe_existence(
     scores: Float64,
     visibilities: Int64,
     means_world: Float64,
-    frame: Frame,
+    camera_world: Float64,
 ) -> None:
-    """Add a frame to the looks at n nodes that it shows.
+    """Add a frame to the viewpoints of n nodes that it shows.
 
     Args:
         records: of all nodes, with `EXISTENCE_FIELDS`; those of the slots are updated.
@@ -253,73 +258,61 @@ def observe_existence(
         scores: (n,) score of its detection; 0 = it was not detected.
         visibilities: (n,) how much of it is visible.
         means_world: (n, 3) means, metres.
-        frame: that shows them.
+        camera_world: (3,) position of the camera, metres.
     """
-    camera_world, stamp_ns, weight = frame
     for index in range(len(slots)):
         record = records[slots[index]]
-        if record.best_score == 0.0:
-            record.first_ns = record.last_ns = record.look_ns = stamp_ns
-            record.look_weight = 1.0
-            for axis in range(3):
-                record.camera_world[axis] = camera_world[axis]
-        # The clock may be behind that of an earlier run: stamps of that run move into the past.
-        behind_ns = max(0, max(record.last_ns, record.look_ns) - stamp_ns)
-        record.first_ns = max(record.first_ns - behind_ns, OLDEST_NS)
-        record.last_ns = max(record.last_ns - behind_ns, OLDEST_NS)
-        record.look_ns = max(record.look_ns - behind_ns, OLDEST_NS)
-        distance_m = step_m = 0.0
+        distance_m = 0.0
         for axis in range(3):
             distance_m += (means_world[index, axis] - camera_world[axis]) ** 2
-            step_m += (record.camera_world[axis] - camera_world[axis]) ** 2
-        distance_m, step_m = math.sqrt(distance_m), math.sqrt(step_m)
+        distance_m = math.sqrt(distance_m)
         if scores[index] == 0.0 and distance_m > REACH_FACTOR * record.reach_m:
             continue
-        has_moved = step_m > max(STILL_M, LOOK_RAD * distance_m)
-        if has_moved or stamp_ns - record.look_ns > LOOK_NS:
-            # Add the present look to those that have ended, and begin a new one.
-            found, missed = _look(record, counts)
-            record.looks += found
-            record.missed += missed
-            record.missed_since += missed
-            look = record.look_weight * min(MAX_WEIGHT, record.shown)
-            record.pending[record.visibility] += look
-            if record.detected > 0:
-                # Misses count for the rates if a detection follows: before, it may be no object.
-                counts[record.visibility, 1] += look
-                for visibility in range(len(counts)):
-                    counts[visibility, 0] += record.pending[visibility]
-                    record.pending[visibility] = 0.0
-            record.detected = record.shown = record.visibility = 0
-            record.look_weight = 1.0 if step_m > STILL_M else STILL_WEIGHT
-            record.look_ns = stamp_ns
+        place = viewpoint(record, means_world[index], camera_world)
+        if place < 0:
+            if record.views:
+                # The camera leaves a viewpoint for a new one: learn the rates from it.
+                left = record.current
+                visibility = record.view_visibility[left]
+                record.pending[visibility] += 1.0
+                if record.view_detected[left] > 0:
+                    fraction = record.view_detected[left] / record.view_shown[left]
+                    counts[visibility, 1] += fraction
+                    for other in range(len(counts)):
+                        counts[other, 0] += record.pending[other]
+                        record.pending[other] = 0.0
+            place = record.views % VIEWS
+            if record.views >= VIEWS:
+                found, missed = _view(record, counts, place)
+                record.looks += found
+                record.missed += missed
+            record.views += 1
             for axis in range(3):
-                record.camera_world[axis] = camera_world[axis]
-        record.shown += weight
-        record.visibility = max(record.visibility, visibilities[index])
+                record.view_camera[place, axis] = camera_world[axis]
+            # A new node begins with the frames before that did not detect it from here.
+            record.view_shown[place] = record.before if record.views == 1 else 0.0
+            record.view_detected[place] = 0.0
+            record.view_visibility[place] = record.view_named[place] = 0
+        record.current = place
+        record.view_shown[place] += 1.0
+        best = max(np.int64(record.view_visibility[place]), visibilities[index])
+        record.view_visibility[place] = best
         if scores[index] > 0.0:
-            # After a clear miss, a node of a moment starts again: it may be an error that returns.
-            if record.missed_since > CLEAR_MISS and record.last_ns - record.first_ns < MOMENT_NS:
-                record.first_ns = stamp_ns
-            record.detected += weight
-            record.missed_since = 0.0
+            record.view_detected[place] += 1.0
+            record.view_named[place] = 1
             record.best_score = max(record.best_score, scores[index])
-            record.last_ns = stamp_ns
             record.reach_m = max(record.reach_m, distance_m)
 
 
 @kernel
-def _look(record: Any, counts: Float64) -> tuple[float, float]:
-    """The summands of the present look for D and M."""
-    if record.shown == 0:
-        return 0.0, 0.0
-    fraction = record.detected / record.shown
-    missed = 0.0
-    if record.visibility > 0:
-        rate = counts[record.visibility, 1] / counts[record.visibility, 0]
+def _view(record: Any, counts: Float64, place: int) -> tuple[float, float]:
+    """The summands of a viewpoint for D and M."""
+    fraction = record.view_detected[place] / record.view_shown[place]
+    visibility, missed = record.view_visibility[place], 0.0
+    rate = counts[visibility, 1] / counts[visibility, 0]
+    if visibility > 0:
         missed = -(1.0 - fraction) * math.log(1.0 - rate)
-    weight = record.look_weight * min(MAX_WEIGHT, record.shown)
-    return weight * fraction, weight * missed
+    return min(1.0, fraction / rate), missed
 
 
 @kernel
@@ -333,14 +326,20 @@ def probabilities(
     result = np.empty(len(slots))
     for index in range(len(slots)):
         record = records[slots[index]]
-        found, missed = _look(record, counts)
+        found, missed, since, detecting = record.looks, record.missed, 0.0, record.looks
+        first = max(0, record.views - VIEWS)
+        for view in range(first, record.views):
+            more, less = _view(record, counts, view % VIEWS)
+            found += more
+            missed += less
+            since = 0.0 if more > 0.0 else since + less
+            detecting += more > 0.0
         score = min(max(record.best_score, MIN_SCORE), MAX_SCORE)
         log_odds = prior + SCORE * math.log(score / (1.0 - score))
-        log_odds += LOOKS * math.log(max(record.looks + found, 1e-3))
+        log_odds += LOOKS * math.log(max(found, 1e-3))
         if with_misses:
-            log_odds -= MISSES * math.log1p(record.missed + missed)
-            if record.last_ns - record.first_ns < MOMENT_NS:
-                since = record.missed_since + (missed if record.detected == 0 else 0.0)
+            log_odds -= MISSES * math.log1p(missed)
+            if detecting <= MOMENT_VIEWS:
                 log_odds -= MOMENT * math.log1p(since)
         result[index] = 1.0 / (1.0 + math.exp(-log_odds))
     return result
@@ -349,15 +348,11 @@ def probabilities(
 def merge(record: Any, other: Any) -> None:
     """Add to a record what was observed of a second node that is the same object."""
     # Both may have been looked at, or missed, from the same positions: the sums are not added.
-    for name in ("best_score", "looks", "last_ns", "reach_m"):
+    for name in ("best_score", "looks", "reach_m"):
         record[name] = max(record[name], other[name])
-    for name in ("missed", "missed_since", "first_ns"):
-        record[name] = min(record[name], other[name])
+    record["missed"] = min(record["missed"], other["missed"])
 
 
 def assume(record: Any, observations: int) -> None:
     """Fill the record of a node that has no looks, from its number of observations."""
     record["best_score"], record["looks"] = 0.9, max(observations, 3)
-    record["first_ns"] = -MOMENT_NS
-    # Its last detection was from another position than any to come.
-    record["camera_world"] = np.inf

@@ -534,7 +534,7 @@ def _transfer(
         scores = scores[[rows[block] for block in cells.blocks.tolist()]]
         scores *= cell_bits(cells.masks).astype(np.int8)
     node_id = int(graph.nodes.ids[to])
-    target.add(to, node_id, graph.nodes.class_probabilities[to], 0)
+    target.add(to, node_id, graph.nodes.class_probabilities[to])
     target.rows[to] = source.rows[slot]
     target.rows["node_id"][to] = node_id
     target.map.add([to], cells)

@@ -25,46 +25,46 @@ class LostNodes:
     """Keeps lost nodes, hidden, for a while. A new node may turn out to be one of them.
 
     Args:
-        memory_s: time in which a lost node may be recognised.
+        memory_frames: number of frames in which a lost node may be recognised.
     """
 
-    def __init__(self, memory_s: float) -> None:
-        self._memory_ns = int(memory_s * 1e9)
-        self._lost_ns: dict[int, int] = {}
+    def __init__(self, memory_frames: int) -> None:
+        self._memory_frames = memory_frames
+        # The frame that lost each node.
+        self._lost: dict[int, int] = {}
 
     def __contains__(self, node_id: object) -> bool:
-        return node_id in self._lost_ns
+        return node_id in self._lost
 
     def __len__(self) -> int:
-        return len(self._lost_ns)
+        return len(self._lost)
 
-    def add(self, node_id: int, stamp_ns: int) -> None:
-        """Add a node whose object is absent."""
-        self._lost_ns[node_id] = stamp_ns
+    def add(self, node_id: int, frame: int) -> None:
+        """Add a node whose object is absent since this frame, by its number."""
+        self._lost[node_id] = frame
 
     def match(self, graph: GlobalGraph, node_id: int) -> int | None:
         """The lost node that is the same object as a new node; None if there is not exactly one."""
         nodes = graph.nodes
-        slots = nodes.slots_of(list(self._lost_ns))
+        slots = nodes.slots_of(list(self._lost))
         earlier = slots[nodes.last_seen_ns[slots] < nodes.first_seen_ns[nodes.slot(node_id)]]
         similar = earlier[_are_similar(graph, node_id, earlier)]
         return int(nodes.ids[similar[0]]) if len(similar) == 1 else None
 
     def remove(self, node_id: int) -> None:
         """Remove a lost node that was recognised."""
-        del self._lost_ns[node_id]
+        del self._lost[node_id]
 
-    def take_expired(self, stamp_ns: int) -> list[int]:
-        """Remove and return the nodes that have been lost for too long."""
-        if stamp_ns - min(self._lost_ns.values(), default=stamp_ns) <= self._memory_ns:
-            return []
-        expired = [
-            node_id
-            for node_id, lost_ns in self._lost_ns.items()
-            if stamp_ns - lost_ns > self._memory_ns
-        ]
+    def take_expired(self, frame: int) -> list[int]:
+        """Remove and return the nodes that have been lost for too long at this frame."""
+        # The first one was lost first.
+        expired = []
+        for node_id, since in self._lost.items():
+            if frame - since <= self._memory_frames:
+                break
+            expired.append(node_id)
         for node_id in expired:
-            del self._lost_ns[node_id]
+            del self._lost[node_id]
         return expired
 
 
@@ -98,15 +98,17 @@ def _are_similar(graph: GlobalGraph, node_id: int, slots: Int64) -> Bool:
 
 # --- Life cycle of a node under the surface rule: published, hidden, merged, lost, removed.
 
-# A hidden node that is less probable than FORGOTTEN is removed when unseen for FORGOTTEN_NS. The
-# time is chosen, not measured: longer than a camera needs to return to an object.
+# A hidden node that is less probable than FORGOTTEN is removed when no frame has detected it for
+# FORGOTTEN_FRAMES, three seconds of video; 30 and 300 found about as much. Frames are counted and
+# not seconds: the same pictures say the same at any rate.
 FORGOTTEN = 0.2
-FORGOTTEN_NS = 10_000_000_000
+FORGOTTEN_FRAMES = 100
 # A node is removed from its position after this number of consecutive frames that see through it.
 # One frame is not enough: depth images have holes and noise.
 ABSENT_FRAMES = 5
-# A moved object keeps its id if it is detected again within this time. Chosen, not measured.
-LOST_S = 30.0
+# A moved object keeps its id if it is detected again within this number of frames, 30 s of video.
+# Chosen, not measured.
+LOST_FRAMES = 900
 # Why a deleted node is not published.
 DELETED = "deleted by the operator"
 
@@ -122,7 +124,7 @@ class LifeCycle:
     def __init__(self, records: NodeRecords, min_existence: float) -> None:
         self._records = records
         self._min_existence = min_existence
-        self._lost = LostNodes(LOST_S)
+        self._lost = LostNodes(LOST_FRAMES)
         # Nodes that may be forgotten; some may have been removed.
         self._improbable: set[int] = set()
 
@@ -144,7 +146,7 @@ class LifeCycle:
             node_ids: node of each row of the frame.
         """
         records, slot_of = self._records, graph.nodes.slot_of
-        self._forget(graph, local.stamp_ns)
+        self._forget(graph)
         scores: dict[int, float] = {}
         for node_id, score in zip(node_ids, local.scores.tolist()):
             scores[node_id] = max(scores.get(node_id, 0.0), score)
@@ -158,13 +160,12 @@ class LifeCycle:
             np.array([shown.get(node_id, NOT_VISIBLE) for node_id in ids], np.int64),
             graph.nodes.means[slots],
             local.T_world_camera[:3, 3],
-            local.stamp_ns,
         )
         self._publish(graph, ids, slots)
         for node_id in self._absent(graph, view, scores.keys()):
             # It may be gone: another absent node of this frame has taken its place.
             if records.has(slot_of.get(node_id)) and node_id not in graph.edits.deleted:
-                self._lose(graph, node_id, local.stamp_ns)
+                self._lose(graph, node_id)
 
     def _absent(self, graph: GlobalGraph, view: View, detected: Collection[int]) -> list[int]:
         """Nodes that enough consecutive frames have seen through."""
@@ -233,8 +234,8 @@ class LifeCycle:
                 self._lost.remove(lost_id)
                 self._move(graph, lost_id, node_id)
 
-    def _forget(self, graph: GlobalGraph, stamp_ns: int) -> None:
-        """Remove improbable nodes that were not seen for long, and nodes lost for too long."""
+    def _forget(self, graph: GlobalGraph) -> None:
+        """Remove improbable nodes that were not detected for long, and nodes lost for too long."""
         nodes = graph.nodes
         if self._improbable:
             # In the order of the slots, which depends on nothing but the frames.
@@ -242,16 +243,17 @@ class LifeCycle:
             self._improbable.intersection_update(ids)
             slots = nodes.slots_of(ids)
             old = _are_improbable(graph, slots)
-            old &= nodes.last_seen_ns[slots] < stamp_ns - FORGOTTEN_NS
+            last = self._records.rows["last_frame"][slots]
+            old &= last < self._records.frames - FORGOTTEN_FRAMES
             for node_id in itertools.compress(ids, old.tolist()):
                 if node_id not in self._lost and not graph.edits.hides(node_id):
                     self._improbable.discard(node_id)
                     self._records.remove(nodes.slot(node_id))
                     graph.remove_node(node_id)
-        for node_id in self._lost.take_expired(stamp_ns):
+        for node_id in self._lost.take_expired(self._records.frames):
             graph.remove_node(node_id)
 
-    def _lose(self, graph: GlobalGraph, node_id: int, stamp_ns: int) -> None:
+    def _lose(self, graph: GlobalGraph, node_id: int) -> None:
         """Remove an absent node from its position; its id may continue elsewhere, now or later."""
         slot = graph.nodes.slot(node_id)
         self._records.remove(slot)
@@ -261,7 +263,7 @@ class LifeCycle:
         graph.set_existence([node_id], graph.nodes.existence[[slot]], np.inf)
         moved_id = moved_object(graph, node_id)
         if moved_id is None:
-            self._lost.add(node_id, stamp_ns)
+            self._lost.add(node_id, self._records.frames)
         else:
             self._move(graph, node_id, moved_id)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +17,7 @@ from deworldsg_ros.merging.matching import JointEvidence
 from deworldsg_ros.merging.surface_map import CELLS_PER_OWNER, VoxelMap
 from deworldsg_ros.merging.views import VISIBILITIES, NodeGrid
 from deworldsg_ros.scene.arrays import Bool, Float64, Int8, Int64
+from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.checks import (
     MAX_SUM_ERROR,
     checked,
@@ -25,13 +27,14 @@ from deworldsg_ros.scene.checks import (
     refuse,
     within,
 )
+from deworldsg_ros.scene.frame_graph import LocalGraph
 
 # --- What the saved state of the surface rule has to fulfil before a kernel works on it.
 
 # Sums that grow with every frame, far from overflow.
 MAX_SUM = 1e15
-# Stamps have 32-bit seconds. Those of an earlier run move into the past, by one such span at most.
-MAX_STAMP_NS = 2 * 2**31 * 10**9
+# Frames in which a new node may have been overlooked.
+RECENT_FRAMES = 10
 # A block is three indices of 19 bits, 21 bits apart (`cell_kernels`).
 _BLOCK_AXIS = (1 << 19) - 1
 _BLOCK_MASK = _BLOCK_AXIS << 42 | _BLOCK_AXIS << 21 | _BLOCK_AXIS
@@ -57,7 +60,14 @@ def check_memory(memory: Arrays, record: np.dtype[np.void], class_count: int) ->
     # The rate of detections is below one: its logarithm is taken.
     holds("looks", (looks[:, 1] < looks[:, 0]).all(), "fewer detections than looks")
     within("fates", checked(memory, "fates", np.int64, 2), 1, 2**52)
-    _check_stamps("last_ns", checked(memory, "last_ns", np.int64))
+    frames = int(checked(memory, "frames", np.int64))
+    within("frames", np.array([frames]), 0, 2**52)
+    within("records (last_frame)", records["last_frame"], 0, frames)
+    poses = checked(memory, "recent_poses", np.float64, None, 4, 4)
+    holds("recent_poses", len(poses) <= RECENT_FRAMES, f"at most {RECENT_FRAMES}")
+    within("recent_poses", poses, -MAX_SUM, MAX_SUM)
+    cameras = checked(memory, "recent_cameras", np.float64, len(poses), 6)
+    within("recent_cameras", cameras, -MAX_SUM, MAX_SUM)
     _check_cells(memory, len(records))
     joint = checked(memory, "joint", np.int64, None, 3)
     distinct("joint", joint[:, :2])
@@ -82,17 +92,18 @@ def _records(memory: Arrays, record: np.dtype[np.void]) -> NDArray[np.void]:
 
 def _check_existence(records: NDArray[np.void]) -> None:
     within("records (best_score)", records["best_score"], 0.0, 1.0 + 1e-9)
-    for name in ("looks", "missed", "missed_since", "reach_m", "detected", "shown", "pending"):
+    for name in ("looks", "missed", "reach_m", "before", "pending", "view_detected", "view_shown"):
         within(f"records ({name})", records[name], 0.0, MAX_SUM)
-    within("records (look_weight)", records["look_weight"], 0.0, 1e3)
-    within("records (visibility)", records["visibility"], 0, len(VISIBILITIES) - 1)
-    for name in ("first_ns", "last_ns", "look_ns", "named_ns"):
-        _check_stamps(f"records ({name})", records[name])
-    # Infinite for the records of nodes without looks.
-    camera = records["camera_world"]
-    within("records (camera_world)", camera[~np.isposinf(camera)], -MAX_SUM, MAX_SUM)
-    detected, shown = records["detected"], records["shown"]
-    holds("records (detected)", (detected <= shown * (1 + 1e-9)).all(), "no more than shown")
+    within("records (views)", records["views"], 0, 2**52)
+    within("records (view_camera)", records["view_camera"], -MAX_SUM, MAX_SUM)
+    within("records (view_visibility)", records["view_visibility"], 0, len(VISIBILITIES) - 1)
+    for name in ("named_from", "current"):
+        within(f"records ({name})", records[name], 0, beliefs.VIEWS - 1)
+    within("records (view_named)", records["view_named"], 0, 1)
+    detected, shown = records["view_detected"], records["view_shown"]
+    holds("records (view_detected)", (detected <= shown).all(), "no more than view_shown")
+    used = np.arange(beliefs.VIEWS) < records["views"][:, None]
+    holds("records (view_shown)", (shown[used] >= 1).all(), "at least one frame")
 
 
 def _check_names(records: NDArray[np.void], class_count: int) -> None:
@@ -125,10 +136,6 @@ def _check_cells(memory: Arrays, count: int) -> None:
     holds("masks", (cells <= CELLS_PER_OWNER).all(), f"at most {CELLS_PER_OWNER} cells of a node")
 
 
-def _check_stamps(name: str, stamps_ns: Int64) -> None:
-    within(name, stamps_ns, -MAX_STAMP_NS, MAX_STAMP_NS)
-
-
 # --- What the surface rule remembers of each node besides the graph.
 
 RECORD = np.dtype(
@@ -136,6 +143,8 @@ RECORD = np.dtype(
         ("node_id", np.int64),
         # Consecutive frames that see through the node.
         ("through_frames", np.int64),
+        # The last frame that detected it, by its number.
+        ("last_frame", np.int64),
         *beliefs.EXISTENCE_FIELDS,
         *beliefs.NAME_FIELDS,
     ],
@@ -150,7 +159,7 @@ class NodeRecords:
         rows: (n,) of `RECORD`, by slot; ``node_id`` is 0 where there is no record.
         looks: looks at objects and those that detected them (`beliefs.first_counts`).
         fates: errors and objects among the nodes so far (`beliefs.first_fates`).
-        last_ns: stamp of the newest frame; 0 = none.
+        frames: number of frames so far.
         map: cells of the surfaces, by slot.
         grid: slots by the position of their node.
         joint: evidence that two slots are one object.
@@ -160,10 +169,31 @@ class NodeRecords:
         self.rows: NDArray[np.void] = np.zeros(64, RECORD)
         self.looks = beliefs.first_counts()
         self.fates = beliefs.first_fates()
-        self.last_ns = 0
+        self.frames = 0
         self.map = VoxelMap()
         self.grid = NodeGrid()
         self.joint = JointEvidence()
+        # Of the newest frames: T_camera_world, and fx, fy, cx, cy, width and height.
+        self.recent: deque[tuple[Float64, Float64]] = deque(maxlen=RECENT_FRAMES)
+
+    def note_frame(self, local: LocalGraph) -> None:
+        """Remember what a frame could show; after its nodes were added."""
+        if local.depth_grid is not None:
+            i = local.depth_grid.intrinsics
+            camera = np.array([i.fx, i.fy, i.cx, i.cy, i.width, i.height])
+            self.recent.appendleft((invert_pose(local.T_world_camera), camera))
+
+    def frames_before(self, mean_world: Float64, camera_world: Float64) -> int:
+        """Number of frames just before that had a place (3,) in view from the same viewpoint."""
+        count = 0
+        for T, (fx, fy, cx, cy, width, height) in self.recent:
+            x, y, z = T[:3, :3] @ mean_world + T[:3, 3]
+            other = -T[:3, :3].T @ T[:3, 3]
+            if not beliefs.is_same_view(mean_world, camera_world, other):
+                break
+            u, v = fx * x / max(z, 1e-9) + cx, fy * y / max(z, 1e-9) + cy
+            count += z > 0 and 0 <= u < width and 0 <= v < height
+        return count
 
     @property
     def slots(self) -> Int64:
@@ -189,14 +219,22 @@ class NodeRecords:
         node_ids: list[int] = self.rows["node_id"][slots].tolist()
         return node_ids
 
-    def add(self, slot: int, node_id: int, class_probabilities: Float64, stamp_ns: int) -> None:
-        """Add the record of a new node."""
+    def add(self, slot: int, node_id: int, class_probabilities: Float64, before: int = 0) -> None:
+        """Add the record of a new node.
+
+        Args:
+            slot: of the node.
+            node_id: of the node.
+            class_probabilities: (C,) of its first detection.
+            before: number of frames before that could have detected it.
+        """
         self._make_room(slot + 1)
         if self.has(slot):  # of a node that has left the graph
             self.remove(slot)
         self.rows[slot] = np.zeros((), RECORD)
         self.rows["node_id"][slot] = node_id
-        beliefs.start(self.rows[slot], np.ascontiguousarray(class_probabilities), stamp_ns)
+        self.rows["last_frame"][slot], self.rows["before"][slot] = self.frames, before
+        beliefs.start(self.rows[slot], np.ascontiguousarray(class_probabilities))
 
     def place(self, graph: GlobalGraph, slots: Sequence[int] | Int64) -> None:
         """Note where the nodes of slots are, after a change of their Gaussians."""
@@ -210,11 +248,9 @@ class NodeRecords:
         visibilities: Int64,
         means_world: Float64,
         camera_world: Float64,
-        stamp_ns: int,
     ) -> None:
-        """Add a frame to the looks at n nodes; see `beliefs.observe_existence`. Once a frame."""
-        step_ns = stamp_ns - self.last_ns if self.last_ns else None
-        self.last_ns = stamp_ns
+        """Add a frame to the viewpoints of n nodes, once; see `beliefs.observe_existence`."""
+        self.frames += 1
         beliefs.observe_existence(
             self.rows,
             self.looks,
@@ -222,15 +258,16 @@ class NodeRecords:
             scores,
             visibilities,
             means_world,
-            beliefs.Frame(
-                np.ascontiguousarray(camera_world), stamp_ns, beliefs.frame_weight(step_ns)
-            ),
+            np.ascontiguousarray(camera_world),
         )
 
-    def name(self, slots: Int64, seen: Float64, stamp_ns: int) -> Float64:
-        """Class distributions (n, C) of n nodes after a frame; see `beliefs.observe_names`."""
-        classes = np.empty_like(seen)
-        beliefs.observe_names(self.rows, slots, seen, stamp_ns, classes)
+    def name(
+        self, slots: Int64, seen: Float64, means_world: Float64, camera_world: Float64
+    ) -> Float64:
+        """Class distributions (n, C) of n detected nodes; see `beliefs.observe_names`."""
+        self.rows["last_frame"][slots] = self.frames
+        classes, camera = np.empty_like(seen), np.ascontiguousarray(camera_world)
+        beliefs.observe_names(self.rows, slots, seen, means_world, camera, classes)
         return classes
 
     def existence(self, slots: Int64) -> Float64:
@@ -267,7 +304,7 @@ class NodeRecords:
         record = self.rows[kept]
         beliefs.merge(record, self.rows[removed])
         classes = graph.nodes.class_probabilities[kept]
-        beliefs.start(record, classes.copy(), int(record["named_ns"]))
+        beliefs.start(record, classes.copy())
         self.joint.merge(kept, removed)
         scores = self.map.scores(removed)
         cells = self.remove(removed)
@@ -286,7 +323,9 @@ class NodeRecords:
             "records": repack_fields(self.rows[slots]),
             "looks": self.looks,
             "fates": self.fates,
-            "last_ns": np.array(self.last_ns),
+            "frames": np.array(self.frames),
+            "recent_poses": np.array([T for T, _ in self.recent]).reshape(-1, 4, 4),
+            "recent_cameras": np.array([camera for _, camera in self.recent]).reshape(-1, 6),
             **self.map.memory(slots),
             "joint": np.array(sorted(pairs), np.int64).reshape(-1, 3),
         }
@@ -297,8 +336,9 @@ class NodeRecords:
         self._make_room(int(slots.max(initial=-1)) + 1)
         self.rows["node_id"][slots] = node_ids
         self.place(graph, slots)
-        # The paper's rule and older releases have no records; cells of another size are useless.
-        if "records" not in memory or checked(memory, "cell_m", np.float64) != self.map.cell_m:
+        # The paper's rule has no records, and older releases have other ones; cells of another size
+        # are useless.
+        if "frames" not in memory or checked(memory, "cell_m", np.float64) != self.map.cell_m:
             _rebuild(self, graph, slots)
             return
         check_memory(memory, RECORD, len(graph.vocabulary.classes))
@@ -311,7 +351,8 @@ class NodeRecords:
         self.rows[known] = records[everything if every else kept]
         self.looks[:] = memory["looks"]
         self.fates[:] = memory["fates"]
-        self.last_ns = int(memory["last_ns"])
+        self.frames = int(memory["frames"])
+        self.recent.extend(zip(memory["recent_poses"], memory["recent_cameras"]))
         own = everything if every else np.repeat(kept, counts)
         starts = np.append(0, np.cumsum(counts[kept]))
         cells = CellSets(memory["blocks"][own], memory["masks"][own], starts)
@@ -369,5 +410,4 @@ def _name(records: NodeRecords, graph: GlobalGraph, slots: Int64) -> None:
     """Begin the names of nodes that have none."""
     nodes = graph.nodes
     for slot in slots.tolist():
-        stamp_ns = int(nodes.last_seen_ns[slot])
-        beliefs.start(records.rows[slot], nodes.class_probabilities[slot], stamp_ns)
+        beliefs.start(records.rows[slot], nodes.class_probabilities[slot])

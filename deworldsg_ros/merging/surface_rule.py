@@ -174,7 +174,7 @@ class SurfaceMerging:
             local.stamp_ns,
             [local.surface_points_world[row] for row in known],
             weights[at],
-            records.name(matched, seen, local.stamp_ns),
+            records.name(matched, seen, graph.nodes.means[matched], local.T_world_camera[:3, 3]),
         )
         for row, slot in enumerate(slots):
             if slot < 0:
@@ -189,9 +189,11 @@ class SurfaceMerging:
                     confirmed=False,
                 )
                 slots[row] = graph.nodes.slot(node_id)
-                records.add(slots[row], node_id, classes, local.stamp_ns)
+                before = records.frames_before(local.means_world[row], local.T_world_camera[:3, 3])
+                records.add(slots[row], node_id, classes, before)
         records.map.add(slots, cells)
         records.place(graph, slots)
+        records.note_frame(local)
         return records.nodes_of(slots)
 
     def _judge_cells(
