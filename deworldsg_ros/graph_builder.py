@@ -121,6 +121,7 @@ class GraphBuilder:
         logits = local.relations.logits
         weights = softmax_weights(logits) if logits.size else None
         node_ids = self.merging.merge(self.graph, self._edges.weigh(local, weights))
+        self.graph.add_colours(local, node_ids)
         votes = frame_votes(logits, weights)
         self._edges.observe(local, node_ids, votes)
         self.frames.note(self.graph, local, node_ids, votes)

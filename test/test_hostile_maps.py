@@ -124,6 +124,8 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
     "duplicate ids": changed("ids", put(1, 1)),
     "next_id below an id": header(next_id=2),
     "existence of 7": changed("existence", put(0, 7.0)),
+    "a colour of NaN": changed("colours", lambda a: a * np.nan),
+    "a lightness of 500": changed("colours", lambda a: a + [500.0, 0.0, 0.0, 1.0]),
     "no observations": changed("observations", put(0, 0)),
     "a weight of 0": changed("weights", put(0, 0.0)),
     "first seen after last seen": changed("first_seen_ns", put(0, 10**18)),

@@ -65,7 +65,9 @@ def _frame_examples() -> dict[str, wire.Message]:
             **image,
             **words,
             objects=[
-                wire.DetectedObject([310.0, 180.5, 352.0, 231.0], 0.91, [0.94, 0.03, 0.03]),
+                wire.DetectedObject(
+                    [310.0, 180.5, 352.0, 231.0], 0.91, [0.94, 0.03, 0.03], [41.5, 52.0, 30.5]
+                ),
                 wire.DetectedObject([120.0, 215.0, 560.0, 402.5], 0.83, [0.02, 0.9, 0.08]),
             ],
             relations=relations,
@@ -149,6 +151,7 @@ def _lifted(
         depth_m=1.82,
         pixel_count=count,
         surface=struct.pack("<6f", mean[0] - 0.02, *mean[1:], mean[0] + 0.02, *mean[1:]),
+        colour_lab=[41.5, 52.0, 30.5],
     )
 
 
@@ -172,6 +175,7 @@ def _node(
         remainder=0.03,
         box=wire.GravityBox(mean, [0.12, 0.1, 0.1], [0.0, 0.0, 0.0, 1.0]),
         surface_mm=b"\n\x00\x00\x00\xec\xff",
+        colour_lab=[41.5, 52.0, 30.5],
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.graph import SceneGraph, distance_m
-from deworldsg_ros.client.meanings import is_class
+from deworldsg_ros.client.meanings import COLOUR_WORDS, KNOWN, colour_shares, is_class
 from deworldsg_ros.client.objects import (
     SURE,
     HiddenObject,
@@ -24,11 +24,12 @@ from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 
 # --- Questions in words: "cup on dining table", "how many chairs", "is the bear on the sofa".
 #
-#     question  = "what changed" [ "since" time ] | [ "how many" | "is" ] pattern
+#     question  = "what changed" [ "since" time ] | [ "how many" | "is" | "what colour" ] pattern
 #     pattern   = [ rank ] thing { [ "and" ] condition }
-#     thing     = class | "anything"
+#     thing     = [ colour ] ( class | "anything" ) | colour
 #     condition = [ "not" ] predicate thing | "near" point | rank | nearest "to" ( thing | point )
-#               | "within" length [ "of" ( thing | point ) ]
+#               | "within" length [ "of" ( thing | point ) ] | colour
+#     colour    = "black", "white", "grey", "red", …
 #     rank      = "largest", "smallest", "highest", … | nearest
 #     nearest   = "closest" | "nearest" | "farthest"
 #     point     = "(" x "," y "," z ")"        length = number [ "m" | "cm" ]
@@ -72,7 +73,7 @@ RANKS = {
     **dict.fromkeys(("farthest", "furthest"), ("distance", True)),
 }
 
-Kind = Literal["find", "count", "exists", "holds"]
+Kind = Literal["find", "count", "exists", "holds", "colour"]
 
 _TOKEN = re.compile(r"\([^()]*\)|[^\s,()]+|[()]")
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -89,6 +90,8 @@ class Condition:
         point: a place instead of an object.
         within_m: largest distance, metres.
         is_negated: whether it has to be false.
+        colour: of the other object; None = any.
+        own_colour: of the object itself; there is nothing else then.
     """
 
     predicate: str | None = None
@@ -96,6 +99,8 @@ class Condition:
     point: Point | None = None
     within_m: float | None = None
     is_negated: bool = False
+    colour: str | None = None
+    own_colour: str | None = None
 
 
 @dataclass(frozen=True)
@@ -106,11 +111,13 @@ class Rank:
         word: of `RANKS`.
         thing: what is near; None = the point, or nothing.
         point: what is near.
+        colour: of the thing; None = any.
     """
 
     word: str
     thing: str | None = None
     point: Point | None = None
+    colour: str | None = None
 
 
 @dataclass(frozen=True)
@@ -120,8 +127,9 @@ class Pattern:
     Attributes:
         thing: class; None = anything.
         conditions: all of them have to hold.
-        kind: ``find``, ``count`` ("how many"), ``exists`` ("is there a cup"), or ``holds`` ("is the
-            cup on …": of the most probable cup, which counts as certain).
+        kind: ``find``, ``count`` ("how many"), ``exists`` ("is there a cup"), ``holds`` ("is the
+            cup on …": of the most probable cup, which counts as certain), or ``colour`` ("what
+            colour is the cup").
         rank: the order of the answers; None = the most probable first.
     """
 
@@ -189,6 +197,7 @@ class Answers:
         count: of "how many": how many of them are more probable than not; else None.
         probability: of "is there": that at least one object fulfils the question; of "is the": that
             the most probable one does, if it exists; else None.
+        colour: of "what colour": the name, and the next one if it is likely, too; else None.
     """
 
     question: str
@@ -196,10 +205,13 @@ class Answers:
     notes: tuple[str, ...] = field(default=())
     count: int | None = None
     probability: float | None = None
+    colour: str | None = None
 
     @property
     def said(self) -> str | None:
-        """The answer to "how many" or "is there" in words; None for other questions."""
+        """The answer to "how many", "is there" or "what colour"; None for other questions."""
+        if self.colour is not None:
+            return self.colour
         if self.count is not None:
             expected = sum(answer.probability for answer in self.found)
             return f"{self.count} (expected number: {expected:.1f})"
@@ -223,6 +235,8 @@ class Answers:
             values["count"] = self.count
         if self.probability is not None:
             values["probability"] = round(self.probability, 3)
+        if self.colour is not None:
+            values["colour"] = self.colour
         if self.said is not None:
             values["said"] = self.said
         return values
@@ -251,6 +265,8 @@ def parse(question: str, predicates: Collection[str] = ()) -> Pattern | Since:
     elif tokens[:1] in (["is"], ["are"]):
         kind = "holds" if tokens[1:2] == ["the"] else "exists"
     tokens = [token for token in tokens if token not in SKIPPED]
+    if tokens[:2] in (["what", "colour"], ["what", "color"]):
+        kind, tokens = "colour", tokens[3:] if tokens[2:3] == ["of"] else tokens[2:]
     return _Reader(question, tokens, _longest_first(predicates)).pattern(kind)
 
 
@@ -264,9 +280,9 @@ class _Reader:
 
     def pattern(self, kind: Kind) -> Pattern:
         rank = self.tokens.pop(0) if self.tokens[:1] and self.tokens[0] in RANKS else None
-        thing = self.thing()
+        thing, colour = self.thing()
         ranks = [] if rank is None else [self._rank(rank)]
-        conditions = []
+        conditions = [] if colour is None else [Condition(own_colour=colour)]
         while self.tokens:
             if self.tokens[0] in RANKS:
                 ranks.append(self._rank(self.tokens.pop(0)))
@@ -288,22 +304,37 @@ class _Reader:
             self.tokens.pop(0)
             if self.tokens and self.tokens[0].startswith("("):
                 return Rank(word, None, self._point())
-            return Rank(word, self.thing())
+            thing, colour = self.thing()
+            return Rank(word, thing, None, colour)
         raise ClientError(
             f"question '{self.question}': {word} to what? expected 'to' and a thing or a point"
         )
 
-    def thing(self) -> str | None:
-        words: list[str] = []
-        while self.tokens and not self._at_condition():
+    def thing(self) -> tuple[str | None, str | None]:
+        """A class (None = anything) and its colour (None = any)."""
+        colour, words = self._colour(), list[str]()
+        # After a thing, a colour is said of it.
+        while self.tokens and not (self._at_condition() or words and self._is_colour()):
             words.append(self.tokens.pop(0))
         name = " ".join(word for word in words if word not in ANYTHING)
-        if words:
-            return name or None
+        if words or colour is not None:
+            return name or None, colour
         raise ClientError(
             f"question '{self.question}': expected a class or 'anything' "
             + (f"before '{' '.join(self.tokens)}'" if self.tokens else "at the end")
         )
+
+    def _colour(self) -> str | None:
+        """Take a leading colour; None for an orange, and if there is none."""
+        if not self.tokens or not self._is_colour():
+            return None
+        ends = len(self.tokens) == 1 or self._at_condition(1) or self._is_colour(1)
+        if self.tokens[0] in KNOWN and ends:
+            return None
+        return COLOUR_WORDS[self.tokens.pop(0)]
+
+    def _is_colour(self, at: int = 0) -> bool:
+        return self.tokens[at] in COLOUR_WORDS
 
     def condition(self) -> Condition:
         if self.tokens[0] == "and":
@@ -311,24 +342,28 @@ class _Reader:
         if self.tokens[:1] == ["not"]:
             self.tokens.pop(0)
             return replace(self.condition(), is_negated=True)
+        if self.tokens and self._is_colour():
+            return Condition(own_colour=COLOUR_WORDS[self.tokens.pop(0)])
         if self.tokens[:1] == ["within"]:
             return self._within(None, None)
         predicate = self._predicate()
         if predicate is None:
             raise ClientError(
                 f"question '{self.question}': '{' '.join(self.tokens) or 'the end'}' is no "
-                "condition; expected a predicate such as on, near or within"
+                "condition; expected a predicate such as on, near or within, or a colour"
             )
         if self.tokens and self.tokens[0].startswith("("):
             if predicate != "near":
                 raise ClientError(f"question '{self.question}': a point needs near or within")
             return self._within(None, self._point())
-        thing = self.thing()
+        thing, colour = self.thing()
         if predicate == "near" and self.tokens[:1] == ["within"]:
-            return self._within(thing, None)
-        return Condition(predicate, thing)
+            return self._within(thing, None, colour)
+        return Condition(predicate, thing, colour=colour)
 
-    def _within(self, thing: str | None, point: Point | None) -> Condition:
+    def _within(
+        self, thing: str | None, point: Point | None, colour: str | None = None
+    ) -> Condition:
         """The rest of a distance; without a length, near a point means 1 m."""
         length_m = 1.0
         if self.tokens[:1] == ["within"]:
@@ -339,10 +374,10 @@ class _Reader:
                 if self.tokens and self.tokens[0].startswith("("):
                     point = self._point()
                 else:
-                    thing = self.thing()
-        if thing is None and point is None:
+                    thing, colour = self.thing()
+        if thing is None and point is None and colour is None:
             raise ClientError(f"question '{self.question}': within what? expected 'of' and a thing")
-        return Condition(None, thing, point, length_m)
+        return Condition(None, thing, point, length_m, colour=colour)
 
     def _length(self) -> float:
         text = self.tokens.pop(0) if self.tokens else ""
@@ -360,13 +395,13 @@ class _Reader:
         x, y, z = map(float, numbers)
         return x, y, z
 
-    def _at_condition(self) -> bool:
-        token = self.tokens[0]
+    def _at_condition(self, at: int = 0) -> bool:
+        token = self.tokens[at]
         is_end = token in ("and", "not", "within", "to", "from") or token in RANKS
-        return is_end or self._match() is not None
+        return is_end or self._match(at) is not None
 
-    def _match(self) -> list[str] | None:
-        return next((n for n in self.names if self.tokens[: len(n)] == n), None)
+    def _match(self, at: int = 0) -> list[str] | None:
+        return next((n for n in self.names if self.tokens[at : at + len(n)] == n), None)
 
     def _predicate(self) -> str | None:
         name = self._match()
@@ -426,11 +461,15 @@ def ask(graph: SceneGraph, question: str) -> Answers:
     items = graph.objects(pattern.thing, min_probability=MIN_PROBABILITY)
     if pattern.kind == "holds":
         items = items[:1]
+    if not any(item.colour for item in graph) and _asks_for_colour(pattern):
+        notes.append("no object of the graph has a colour: it was made by an older release")
     answers = [answer for item in items if (answer := _answer(graph, pattern, item)) is not None]
     answers.sort(key=lambda answer: (-answer.probability, answer.item.id))
     if pattern.rank is not None:
         answers, more = _ranked(graph, pattern.rank, answers)
         notes += more
+    if pattern.kind == "colour":
+        answers = answers[:1]
     if not answers:
         notes.insert(0, f"nothing fulfils this with {MIN_PROBABILITY:.0%} or more")
     chances = [answer.probability for answer in answers]
@@ -443,7 +482,38 @@ def ask(graph: SceneGraph, question: str) -> Answers:
         probability=1.0 - math.prod(1.0 - chance for chance in chances)
         if pattern.kind in ("exists", "holds")
         else None,
+        colour=_colour_in_words(answers[0].item) if pattern.kind == "colour" and answers else None,
     )
+
+
+def _asks_for_colour(pattern: Pattern) -> bool:
+    asked = [name for one in pattern.conditions for name in (one.colour, one.own_colour)]
+    of_rank = None if pattern.rank is None else pattern.rank.colour
+    return pattern.kind == "colour" or any([*asked, of_rank])
+
+
+def _colour_in_words(item: SceneObject) -> str:
+    """The colour of an object: "red", "grey or black"."""
+    if item.colour_lab is None:
+        return "its colour is not known"
+    shares = colour_shares(item.colour_lab)
+    best = max(shares.values())
+    names = [name for name, share in shares.items() if share >= 0.5 * best]
+    lightness, a, b = item.colour_lab
+    return f"{' or '.join(names[:2])} (CIELAB {lightness:.0f}, {a:.0f}, {b:.0f})"
+
+
+def _things(
+    items: Iterable[SceneObject], thing: str | None, colour: str | None
+) -> list[tuple[SceneObject, float, float]]:
+    """The objects that may be a thing of a colour, with the probabilities of both; best first."""
+    found = []
+    for item in items:
+        of_class = 1.0 if thing is None else item.probability_of(thing)
+        of_colour = 1.0 if colour is None else item.probability_of_colour(colour)
+        if of_class * of_colour >= MIN_PROBABILITY:
+            found.append((item, of_class, of_colour))
+    return sorted(found, key=lambda one: (-one[1] * one[2], one[0].id))
 
 
 def _understood(graph: SceneGraph, asked: Pattern) -> tuple[Pattern, list[str]]:
@@ -472,11 +542,11 @@ def _ranked(graph: SceneGraph, rank: Rank, answers: list[Answer]) -> tuple[list[
     """The sure answers by a rank, each with what was compared, the first one first."""
     kind, most_first = RANKS[rank.word]
     near: Point | SceneObject | None = rank.point
-    if rank.thing is not None:
-        others = graph.objects(rank.thing, min_probability=MIN_PROBABILITY)
+    if rank.thing is not None or rank.colour is not None:
+        others = _things(graph, rank.thing, rank.colour)
         if not others:
             return [], []
-        near = others[0]
+        near = others[0][0]
 
     def value(item: SceneObject) -> tuple[float, str]:
         if kind == "distance":
@@ -550,6 +620,8 @@ def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | 
     relations = []
     chance = 1.0 if is_certain else chance
     for condition in pattern.conditions:
+        if condition.own_colour is not None and item.colour is None:
+            return None
         part = _best_part(graph, item, condition, is_certain)
         if condition.is_negated:
             held = 0.0 if part is None else part[0]
@@ -566,7 +638,10 @@ def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | 
 
 def _words(condition: Condition) -> str:
     """A condition as it is asked."""
+    if condition.own_colour is not None:
+        return condition.own_colour
     thing = condition.thing or ("anything" if condition.point is None else "the point")
+    thing = thing if condition.colour is None else f"{condition.colour} {thing}"
     if condition.predicate is None:
         return f"within {condition.within_m or 0.0:g} m of {thing}"
     return f"{condition.predicate} {thing}"
@@ -576,6 +651,9 @@ def _best_part(
     graph: SceneGraph, item: SceneObject, condition: Condition, is_certain: bool
 ) -> _Part | None:
     """The most probable way to fulfil a condition; the other object may count as certain."""
+    if condition.own_colour is not None:
+        share = item.probability_of_colour(condition.own_colour)
+        return (share, None, f"{condition.own_colour} ({share:.0%})") if share > 0 else None
     if condition.point is not None:
         is_close = distance_m(item, condition.point) <= (condition.within_m or 0.0)
         return (1.0, None, f"within {condition.within_m:g} m") if is_close else None
@@ -583,15 +661,21 @@ def _best_part(
         around = graph.objects(near=item, within=condition.within_m or 0.0)
     else:
         around = [found.object for found in graph.relations(item, condition.predicate)]
-    others: list[tuple[SceneObject, float]] = []
-    for other in sorted(dict.fromkeys(around), key=lambda other: other.id):
-        chance = 1.0 if condition.thing is None else other.probability_of(condition.thing)
-        if other.id != item.id and chance >= MIN_PROBABILITY:
-            others.append((other, chance))
+    around = [other for other in dict.fromkeys(around) if other.id != item.id]
+    others = _things(around, condition.thing, condition.colour)
     parts = [
         part
-        for other in others
-        if (part := _part(graph, item, condition, *other, 1.0 if is_certain else other[1]))
+        for other, chance, of_colour in sorted(others, key=lambda one: one[0].id)
+        if (
+            part := _part(
+                graph,
+                item,
+                condition,
+                other,
+                chance * of_colour,
+                of_colour if is_certain else chance * of_colour,
+            )
+        )
     ]
     return max(parts, key=lambda part: part[0], default=None)
 

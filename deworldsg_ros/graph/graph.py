@@ -218,6 +218,19 @@ class GlobalGraph:
             self.nodes.class_probabilities[slots] = classes_after
         self._changed(slots)
 
+    def add_colours(self, local: LocalGraph, node_ids: Sequence[int]) -> None:
+        """Add the colours of a frame, weighted by pixels, to its nodes (0 = none)."""
+        if local.colours_lab is None:
+            return
+        slot_of = self.nodes.slot_of
+        slots = np.array([slot_of.get(node_id, -1) for node_id in node_ids], np.int64)
+        known = (slots >= 0) & ~np.isnan(local.colours_lab).any(axis=1)
+        weights = local.pixel_counts[known, None].astype(np.float64)
+        # Two rows of a frame may be one node.
+        seen = np.concatenate([weights * local.colours_lab[known], weights], axis=1)
+        np.add.at(self.nodes.colours, slots[known], seen)
+        self._changed(slots[known])
+
     def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
         """Remove some of the surface points of n live nodes; see `NodeTable.drop_points`."""
         self._changed(self.nodes.drop_points(self.nodes.slots_of(node_ids), dropped))
@@ -451,7 +464,7 @@ def copy_node(
     confirmed = bool(nodes.confirmed[slot])
     new_id = graph.add_node(mean, covariance, classes, first_ns, surface, weight, confirmed)
     new = nodes.slot(new_id)
-    for name in ("class_probabilities", "observations", "existence", "last_seen_ns"):
+    for name in ("class_probabilities", "observations", "existence", "last_seen_ns", "colours"):
         getattr(nodes, name)[new] = getattr(nodes, name)[slot]
     graph.copy_relations(node_id, new_id, without)
     return new_id

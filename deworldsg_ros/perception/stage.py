@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from deworldsg_ros.config import PerceptionConfig
@@ -18,7 +20,16 @@ from deworldsg_ros.perception.protocols import (
     SegmentedObjects,
     Segmenter,
 )
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16, areas, shared_areas
+from deworldsg_ros.scene.arrays import (
+    Bool,
+    Float32,
+    Float64,
+    Int64,
+    UInt8,
+    UInt16,
+    areas,
+    shared_areas,
+)
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, UpEstimator, quarter_turns
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, MaskPatch, Relations, Vocabulary
@@ -269,6 +280,51 @@ def instance_image(
     return labels
 
 
+# --- The colour of each object.
+
+# Pixels of the patch around an object of which the colours are taken, evenly spaced: about as many.
+COLOUR_SAMPLES = 200
+# Factors and offsets from the 8-bit CIELAB of OpenCV.
+LAB_SCALE, LAB_OFFSET = np.array([100.0 / 255.0, 1.0, 1.0]), np.array([0.0, 128.0, 128.0])
+
+
+def mean_colours(
+    rgb: UInt8, instances: UInt16, windows: Sequence[tuple[slice, slice]]
+) -> Float32 | None:
+    """Mean colour of each object, in CIELAB.
+
+    Half of its pixels count, those of medium lightness: neither the highlights nor the shadows, nor
+    what a mask contains of a lighter or darker background.
+
+    Args:
+        rgb: (H, W, 3) uint8, RGB order.
+        instances: (H, W) uint16 instance image.
+        windows: n slices of rows and columns around the objects.
+
+    Returns:
+        (n, 3) float32; a row of NaN for an object without a sampled pixel. None if no object has a
+        colour.
+    """
+    samples = []
+    for row, (rows, columns) in enumerate(windows):
+        area = (rows.stop - rows.start) * (columns.stop - columns.start)
+        step = max(1, round(math.sqrt(area / COLOUR_SAMPLES)))
+        of_object = instances[rows, columns][step // 2 :: step, step // 2 :: step] == row + 1
+        samples.append(rgb[rows, columns][step // 2 :: step, step // 2 :: step][of_object])
+    counts = np.array([len(pixels) for pixels in samples], np.int64)
+    if not counts.any():
+        return None
+    lab = cv2.cvtColor(np.concatenate(samples)[:, None], cv2.COLOR_RGB2Lab)[:, 0]
+    colours = np.full((len(counts), 3), np.nan, np.float32)
+    ends = counts.cumsum()
+    for row in np.flatnonzero(counts).tolist():
+        own = lab[ends[row] - counts[row] : ends[row]]
+        quarter = counts[row] // 4
+        medium = own[:, 0].argsort(kind="stable")[quarter : counts[row] - quarter]
+        colours[row] = (own[medium].mean(axis=0) - LAB_OFFSET) * LAB_SCALE
+    return colours
+
+
 # --- Stage a: one RGB-D frame → its 2D scene graph and its instance image.
 
 logger = logging.getLogger(__name__)
@@ -435,6 +491,7 @@ class Perception:
             class_probabilities=objects.class_probabilities,
             scores=objects.scores,
             relations=relations,
+            colours_lab=mean_colours(frame.rgb, instances, [mask.window for mask in masks]),
         )
         return Perceived(frame_graph, instances, dict(drops), self._failures)
 

@@ -81,6 +81,8 @@ class FrameGraph:
         class_probabilities: (n, C) float64, calibrated, rows sum to one.
         scores: (n,) float64, the detector's own score.
         relations: visual relations between rows.
+        colours_lab: (n, 3) float32, mean colour of each object, CIELAB; a row of NaN, or None = not
+            known.
 
     The k-th object (from 0) has the value k + 1 in the frame's instance image, (H, W) uint16.
     """
@@ -94,10 +96,12 @@ class FrameGraph:
     class_probabilities: Float64
     scores: Float64
     relations: Relations
+    colours_lab: Float32 | None = None
 
     def __post_init__(self) -> None:
         count = len(self.boxes_xyxy)
         checks.check_boxes(self.boxes_xyxy, count)
+        checks.check_colours(self.colours_lab, count)
         _check_objects(count, self.vocabulary, self.class_probabilities, self.scores)
         _check_relations(count, self.vocabulary, self.relations)
 
@@ -161,6 +165,7 @@ class LocalGraph:
         relations: visual relations between rows.
         drops: number of objects not lifted, by reason.
         depth_grid: depth and instances of the whole image; None = not available.
+        colours_lab: (n, 3) float32, as those of the frame graph.
     """
 
     stamp_ns: int
@@ -181,6 +186,7 @@ class LocalGraph:
     relations: Relations
     drops: dict[str, int] = field(default_factory=dict)
     depth_grid: DepthGrid | None = None
+    colours_lab: Float32 | None = None
 
     def __post_init__(self) -> None:
         count = len(self.means_world)
@@ -190,6 +196,7 @@ class LocalGraph:
             raise ValueError(str(refusal)) from refusal
         checks.check_boxes(self.boxes_xyxy, count)
         checks.check_instance_ids(self.instance_ids, count)
+        checks.check_colours(self.colours_lab, count)
         checks.check_counts("pixel counts", self.pixel_counts, count)
         _check_objects(count, self.vocabulary, self.class_probabilities, self.scores)
         _check_relations(count, self.vocabulary, self.relations)
@@ -244,6 +251,7 @@ def lifted(
         class_probabilities=frame.class_probabilities[rows],
         scores=frame.scores[rows],
         relations=_between(frame.relations, rows, len(frame)),
+        colours_lab=None if frame.colours_lab is None else frame.colours_lab[rows],
         **geometry,
     )
     local.check_geometry()

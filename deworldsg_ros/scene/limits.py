@@ -64,6 +64,8 @@ MIN_VARIANCE_RATIO = 1e-13
 MAX_LOGIT = 1e9
 # Geometric costs of pairs (Eq. 8): half a diagonal and a difference of depths, metres.
 MAX_COST = 1e6
+# Values of a CIELAB colour. Those of sRGB are up to 108.
+MAX_LAB = 128.0
 # Length of a label or frame_id, characters.
 MAX_NAME_CHARACTERS = 256
 # Size of a message of one frame: 256 objects with 800 points each need 12 MB.

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
-import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
@@ -69,6 +70,21 @@ def _rows(rows: list[list[float]], width: int, name: str) -> Float64:
     return np.array(rows, np.float64).reshape(len(rows), width)
 
 
+def _colours_to_wire(colours_lab: Float32 | None, count: int) -> list[list[float] | UnsetType]:
+    if colours_lab is None:
+        return [UNSET] * count
+    return [row if row[0] == row[0] else UNSET for row in colours_lab.tolist()]  # NaN differs
+
+
+def _colours_from_wire(items: Sequence[wire.DetectedObject | wire.LiftedObject]) -> Float32 | None:
+    """Colours (n, 3), a row of NaN where there is none; None if no object has one."""
+    if all(item.colour_lab is UNSET for item in items):
+        return None
+    nothing = [float("nan")] * 3
+    rows = [nothing if item.colour_lab is UNSET else item.colour_lab for item in items]
+    return np.array(rows, np.float32)
+
+
 @lru_cache(maxsize=4)
 def _vocabulary(classes: tuple[str, ...], predicates: tuple[str, ...]) -> Vocabulary:
     """The vocabulary, checked once: every message of a session repeats it."""
@@ -92,8 +108,9 @@ def frame_graph_to_message(graph: FrameGraph) -> wire.FrameGraphMessage:
                 graph.boxes_xyxy[row].tolist(),
                 float(graph.scores[row]),
                 graph.class_probabilities[row].tolist(),
+                colour,
             )
-            for row in range(len(graph))
+            for row, colour in enumerate(_colours_to_wire(graph.colours_lab, len(graph)))
         ],
         relations=_relations_to_wire(graph.relations),
     )
@@ -117,6 +134,7 @@ def frame_graph_from_message(message: wire.FrameGraphMessage) -> FrameGraph:
             ),
             scores=np.array([item.score for item in objects], np.float64),
             relations=_relations_from_wire(message.relations, len(message.predicates)),
+            colours_lab=_colours_from_wire(objects),
         )
     except ValueError as error:
         raise RefusedInput("invalid_message", f"frame graph: {error}") from error
@@ -144,8 +162,9 @@ def local_graph_to_message(graph: LocalGraph) -> wire.LocalGraphMessage:
                 depth_m=float(graph.depths_m[row]),
                 pixel_count=int(graph.pixel_counts[row]),
                 surface=graph.surface_points_world[row].astype("<f4").tobytes(),
+                colour_lab=colour,
             )
-            for row in range(len(graph))
+            for row, colour in enumerate(_colours_to_wire(graph.colours_lab, len(graph)))
         ],
         relations=_relations_to_wire(graph.relations),
         drops=dict(graph.drops),
@@ -182,6 +201,7 @@ def local_graph_from_message(message: wire.LocalGraphMessage) -> LocalGraph:
             relations=_relations_from_wire(message.relations, len(message.predicates)),
             drops=message.drops,
             depth_grid=_depth_grid_from_wire(message),
+            colours_lab=_colours_from_wire(objects),
         )
     except ValueError as error:
         raise RefusedInput("invalid_message", f"local graph: {error}") from error
@@ -189,12 +209,12 @@ def local_graph_from_message(message: wire.LocalGraphMessage) -> LocalGraph:
 
 def _surface(item: wire.LiftedObject, schema: wire.Schema) -> Float32:
     """The surface points (k, 3) of an object in a message of any version."""
-    if (item.surface_points_m is msgspec.UNSET) != (schema.version > 1):
+    if (item.surface_points_m is UNSET) != (schema.version > 1):
         raise ValueError(
             f"object {item.instance} of version {schema.version}: version 1 has surface_points_m, "
             "and later ones have surface"
         )
-    if item.surface_points_m is msgspec.UNSET:
+    if item.surface_points_m is UNSET:
         return np.frombuffer(item.surface, "<f4").reshape(-1, 3).astype(np.float32)
     return np.array(item.surface_points_m, np.float32).reshape(-1, 3)
 

@@ -22,6 +22,7 @@ from deworldsg_ros.scene.limits import (
     MAX_GRAPH_VARIANCE_M2,
     MAX_INSTANCE,
     MAX_INT,
+    MAX_LAB,
     MAX_LOGIT,
     MAX_NAME_CHARACTERS,
     MAX_NAMES,
@@ -82,6 +83,18 @@ Logits = Annotated[
 Name = Annotated[
     str,
     msgspec.Meta(max_length=MAX_NAME_CHARACTERS, description="without control characters"),
+]
+Colour = Annotated[
+    Union[
+        Annotated[
+            list[Annotated[float, msgspec.Meta(ge=-MAX_LAB, le=MAX_LAB)]],
+            msgspec.Meta(min_length=3, max_length=3),
+        ],
+        msgspec.UnsetType,
+    ],
+    msgspec.Meta(
+        description="mean colour of the surface, CIELAB (D65): L* a* b*; absent = unknown"
+    ),
 ]
 # Of a scene graph, in metres.
 Vector3 = Annotated[
@@ -156,6 +169,7 @@ class DetectedObject(msgspec.Struct):
     box_xyxy: Box
     score: Probability
     class_probabilities: Distribution
+    colour_lab: Colour = msgspec.UNSET
 
 
 class FrameGraphMessage(Message, kw_only=True):
@@ -196,6 +210,7 @@ class LiftedObject(msgspec.Struct):
             "base64; replaces surface_points_m",
         ),
     ] = b""
+    colour_lab: Colour = msgspec.UNSET
 
 
 class DepthGridState(msgspec.Struct, frozen=True):
@@ -318,6 +333,7 @@ class NodeState(msgspec.Struct, frozen=True, gc=False):
         Union[Literal["operator"], msgspec.UnsetType],
         msgspec.Meta(description="operator = set by hand; absent = from the frames"),
     ] = msgspec.UNSET
+    colour_lab: Colour = msgspec.UNSET
 
 
 class HiddenNode(msgspec.Struct, frozen=True):

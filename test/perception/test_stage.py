@@ -4,6 +4,7 @@ import sys
 from collections import Counter
 from itertools import islice
 
+import cv2
 import numpy as np
 import pytest
 from support import failing_backend
@@ -24,6 +25,7 @@ from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception import Detections, Perception, build_perception
 from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
+from deworldsg_ros.perception.stage import mean_colours
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.ros.health import REASONS
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
@@ -86,6 +88,23 @@ def test_a_table_and_a_cup():
     # Boxes are clipped to the image.
     found = perceive([[-20, -30, 60, 300]], [0], [0.9])
     assert found.frame_graph.boxes_xyxy.tolist() == [[0, 0, 60, HEIGHT - 1]]
+
+
+def test_the_colour_of_an_object_is_that_of_its_mask_without_lights_and_shadows():
+    # A red object in two parts of its patch, with a tenth of glare and of shadow, on blue.
+    rgb, instances = np.full((100, 120, 3), (0, 0, 255), np.uint8), np.zeros((100, 120), np.uint16)
+    instances[10:90, 10:40] = instances[10:90, 70:100] = 2
+    rgb[instances == 2] = 200, 30, 30
+    rgb[10:18, 10:100], rgb[82:90, 10:100] = 255, 0
+    patch, nothing = (slice(10, 90), slice(10, 100)), (slice(0, 5), slice(0, 5))
+    colours = mean_colours(rgb, instances, [nothing, patch])
+    expected = cv2.cvtColor(np.float32([[[200, 30, 30]]]) / 255, cv2.COLOR_RGB2Lab)[0, 0]
+    np.testing.assert_allclose(colours[1], expected, atol=1.5)
+    assert np.isnan(colours[0]).all() and mean_colours(rgb, instances, [nothing]) is None
+
+    found = perceive([TABLE, CUP], [0, 1], [0.6, 0.9]).frame_graph
+    cup = cv2.cvtColor(RGB[OWNER == 2][None].astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[0]
+    np.testing.assert_allclose(found.colours_lab[0], np.median(cup, axis=0), atol=6)
 
 
 VIEW = [0.03 * WIDTH, 0.03 * HEIGHT, 0.97 * WIDTH, 0.97 * HEIGHT]

@@ -63,6 +63,14 @@ def random_classes(rng: np.random.Generator, count: int, classes: int = 4) -> ND
     return powers / powers.sum(axis=1, keepdims=True)
 
 
+def random_colours(objects: NDArray[np.int64], stamp_ns: int) -> NDArray[np.float32] | None:
+    """CIELAB colours (n, 3) of objects, with noise; unknown in some frames and of some objects."""
+    rng = np.random.default_rng(stamp_ns)
+    colours = rng.normal(0, 2, (len(objects), 3)) + [50, 0, 0] + 5 * objects[:, None]
+    colours[rng.random(len(objects)) < 0.2] = np.nan
+    return None if stamp_ns % 5 == 0 or np.isnan(colours).all() else colours.astype(np.float32)
+
+
 def local_graph(
     stamp_ns: int,
     means: NDArray[np.float64],
@@ -131,6 +139,7 @@ def random_local_graphs(rng: np.random.Generator, frames: int) -> list[LocalGrap
                 ),
                 pairs=pairs,
                 logits=rng.normal(0, 2, (len(pairs), 3)),
+                colours_lab=random_colours(seen, stamp_ns),
             )
         )
     return graphs

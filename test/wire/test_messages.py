@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from support.merging import (
     VOCABULARY,
     random_classes,
+    random_colours,
     random_covariances,
     random_pose,
     seeds,
@@ -83,6 +84,7 @@ def random_objects(rng: np.random.Generator, count: int) -> dict[str, Any]:
             rng.normal(0, 10 ** rng.uniform(-6, 6), (len(pairs), 3)),
             rng.random(len(pairs)),
         ),
+        "colours_lab": random_colours(rng.integers(0, 9, count), int(rng.integers(1000))),
     }
 
 
