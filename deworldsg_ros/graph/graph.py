@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.graph.edits import Edit, EditLog
+from deworldsg_ros.graph.embeddings import NodeEmbeddings
 from deworldsg_ros.graph.extent import even_moments
 from deworldsg_ros.graph.nodes import SAVED, IdState, NodeIds, NodeTable, Observations
 from deworldsg_ros.graph.pairs import (
@@ -43,6 +44,7 @@ class GraphState:
         pairs: evidence of edges, and votes.
         ids: the id memory.
         edits: of an operator, oldest first.
+        embeddings: `NodeEmbeddings.arrays`.
     """
 
     vocabulary: Vocabulary
@@ -56,6 +58,7 @@ class GraphState:
     remembered_frames: int
     even_gaussians: bool
     edits: Sequence[Edit] = ()
+    embeddings: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
 
 class GlobalGraph:
@@ -72,6 +75,7 @@ class GlobalGraph:
         nodes: the nodes as parallel arrays; read only.
         pairs: what is known about pairs of nodes, by slots.
         edits: what an operator has said about nodes; read only.
+        embeddings: what some of the nodes look like; read only.
         even_gaussians: messages show the `even_moments` of a node's surface instead of the pooled
             Gaussian.
     """
@@ -91,6 +95,7 @@ class GlobalGraph:
         self.even_gaussians = even_gaussians
         self.nodes = NodeTable(len(vocabulary.classes), surface_point_capacity)
         self.edits = EditLog()
+        self.embeddings = NodeEmbeddings()
         self._ids = NodeIds(self.nodes, remembered_frames)
         self._watchers: list[dict[int, int]] = []
         self.pairs = PairStore(self.nodes, len(vocabulary.predicates))
@@ -109,6 +114,7 @@ class GlobalGraph:
         graph.pairs.restore(state.pairs)
         graph._ids = NodeIds(graph.nodes, state.remembered_frames, state.ids)
         graph.edits = EditLog(state.edits)
+        graph.embeddings.restore(state.embeddings, graph.nodes.ids)
         return graph
 
     def state(self) -> GraphState:
@@ -127,6 +133,7 @@ class GlobalGraph:
             remembered_frames=self.remembered_frames,
             even_gaussians=self.even_gaussians,
             edits=list(self.edits.edits),
+            embeddings=self.embeddings.arrays(),
         )
 
     def __len__(self) -> int:
@@ -231,6 +238,22 @@ class GlobalGraph:
         np.add.at(self.nodes.colours, slots[known], seen)
         self._changed(slots[known])
 
+    def add_embeddings(self, local: LocalGraph, node_ids: Sequence[int]) -> None:
+        """Add the embeddings of a frame to its nodes (0 = none).
+
+        Raises:
+            RefusedInput: ``embedding_model_mismatch``; nothing is added then.
+        """
+        seen = local.embeddings
+        if seen is None:
+            return
+        self.embeddings.check_fits(seen)
+        for row, vector in zip(seen.rows.tolist(), seen.vectors):
+            slot = self.nodes.slot_of.get(node_ids[row])
+            if slot is not None:
+                direction = local.T_world_camera[:3, 3] - self.nodes.means[slot]
+                self.embeddings.add(node_ids[row], direction, vector, seen.model)
+
     def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
         """Remove some of the surface points of n live nodes; see `NodeTable.drop_points`."""
         self._changed(self.nodes.drop_points(self.nodes.slots_of(node_ids), dropped))
@@ -268,6 +291,8 @@ class GlobalGraph:
         """Apply a pose correction (4, 4), from the old world frame to the new, to a live node."""
         slot = self.nodes.slot(node_id)
         self.nodes.move(slot, T_correction)
+        if self.embeddings.views:
+            self.embeddings.turn(node_id, T_correction[:3, :3])
         self._changed([slot])
 
     def resolve(self, node_id: int) -> int:
@@ -326,6 +351,8 @@ class GlobalGraph:
         kept_id, removed_id = min(a_id, b_id), max(a_id, b_id)
         slot, removed = self.nodes.slot(kept_id), self.nodes.slot(removed_id)
         self.nodes.merge(slot, removed)
+        if self.embeddings.views:
+            self.embeddings.merge(kept_id, removed_id)
         self._changed([slot])
         self.pairs.merge(removed, slot)
         self._remove(removed_id, kept_id)
@@ -339,6 +366,8 @@ class GlobalGraph:
         """
         slot, new = self.nodes.slot(old_id), self.nodes.slot(new_id)
         self.nodes.take_over(slot, new)
+        if self.embeddings.views:
+            self.embeddings.merge(old_id, new_id)
         self._changed([slot])
         self.pairs.drop(slot)
         self.pairs.merge(new, slot)
@@ -426,6 +455,8 @@ class GlobalGraph:
         for watcher in self._watchers:
             watcher[node_id] = self.nodes.slot(node_id)
         self.nodes.remove(node_id)
+        if self.embeddings.views:
+            self.embeddings.remove(node_id)
         self._ids.retire(node_id, successor)
         if self.edits:
             self._drop(self.edits.removed(node_id, successor))
@@ -467,6 +498,7 @@ def copy_node(
     for name in ("class_probabilities", "observations", "existence", "last_seen_ns", "colours"):
         getattr(nodes, name)[new] = getattr(nodes, name)[slot]
     graph.copy_relations(node_id, new_id, without)
+    graph.embeddings.copy(node_id, new_id)
     return new_id
 
 

@@ -296,6 +296,7 @@ def to_arrays(state: GraphState) -> Arrays:
         **vars(state.pairs),
         **_id_arrays(state.ids),
         **_edit_arrays(state),
+        **state.embeddings,
     }
 
 
@@ -351,6 +352,7 @@ def _state(arrays: Arrays) -> GraphState:
         remembered_frames=header.remembered_frames,
         even_gaussians=header.even_gaussians,
         edits=edits,
+        embeddings=arrays,
     )
 
 

@@ -252,6 +252,7 @@ def _with_objects(local: LocalGraph, objects: list[_Object], grid: DepthGrid | N
         relations=Relations.none(len(local.vocabulary.predicates)),
         depth_grid=grid,
         colours_lab=None,
+        embeddings=None,
     )
 
 

@@ -19,6 +19,7 @@ from deworldsg_ros.perception.protocols import (
     RelationHead,
     SegmentedObjects,
     Segmenter,
+    unit_embeddings,
 )
 from deworldsg_ros.scene.arrays import (
     Bool,
@@ -32,7 +33,7 @@ from deworldsg_ros.scene.arrays import (
 )
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, UpEstimator, quarter_turns
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.frame_graph import FrameGraph, MaskPatch, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import Embeddings, FrameGraph, MaskPatch, Relations, Vocabulary
 from deworldsg_ros.scene.limits import check_names
 
 # --- Frames of a camera that is mounted on its side, turned upright for the detector.
@@ -492,8 +493,17 @@ class Perception:
             scores=objects.scores,
             relations=relations,
             colours_lab=mean_colours(frame.rgb, instances, [mask.window for mask in masks]),
+            embeddings=self._embeddings(objects),
         )
         return Perceived(frame_graph, instances, dict(drops), self._failures)
+
+    def _embeddings(self, objects: Detections) -> Embeddings | None:
+        """Those of the detector."""
+        if objects.embeddings is None:
+            return None
+        rows = np.arange(len(objects))
+        found = unit_embeddings(objects.embeddings, rows, objects.embedding_model)
+        return found if len(found.rows) else None
 
     def detect(self, frame: RgbdFrame) -> Detections:
         """Objects and, if refined, weak boxes of an upright frame; raises ``detector_error``."""

@@ -248,6 +248,8 @@ REASONS: dict[str, str] = {
     "nan_features": "The world model computed NaN or infinity for a clip. The clip gives no "
     "prediction. Run it on the CPU (`perception.device: cpu`), and report it with "
     "`deworldsg models inspect`.",
+    "embedding_model_mismatch": "A frame has embeddings of another model than the graph. It is "
+    "merged without them. Use one model, or begin a new graph (the service `clear`).",
     # Files
     "map_not_written": "A checkpoint of the map could not be written; the file holds the one "
     "before. Make room on the disk, or take another `map_path`.",

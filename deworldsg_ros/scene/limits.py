@@ -66,6 +66,8 @@ MAX_LOGIT = 1e9
 MAX_COST = 1e6
 # Values of a CIELAB colour. Those of sRGB are up to 108.
 MAX_LAB = 128.0
+# Values of an embedding. Those of CLIP and SigLIP have 512 to 1536.
+MAX_EMBEDDING = 2048
 # Length of a label or frame_id, characters.
 MAX_NAME_CHARACTERS = 256
 # Size of a message of one frame: 256 objects with 800 points each need 12 MB.

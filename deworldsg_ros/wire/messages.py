@@ -15,6 +15,7 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.limits import (
     MAX_COORDINATE_M,
     MAX_COST,
+    MAX_EMBEDDING,
     MAX_FOCAL_PX,
     MAX_FRAME_BYTES,
     MAX_GRAPH_BYTES,
@@ -96,6 +97,22 @@ Colour = Annotated[
         description="mean colour of the surface, CIELAB (D65): L* a* b*; absent = unknown"
     ),
 ]
+# Values of half precision take two bytes.
+Vector16 = Annotated[
+    bytes,
+    msgspec.Meta(
+        max_length=2 * MAX_EMBEDDING,
+        description="vector of length 1, float16 little-endian, base64",
+    ),
+]
+Embedding = Annotated[
+    Union[Vector16, msgspec.UnsetType],
+    msgspec.Meta(description="what the image shows of the object; absent = not embedded"),
+]
+Model = Annotated[
+    Union[Name, msgspec.UnsetType],
+    msgspec.Meta(description="that made the embeddings; absent = there are none"),
+]
 # Of a scene graph, in metres.
 Vector3 = Annotated[
     list[Annotated[float, msgspec.Meta(ge=-MAX_GRAPH_COORDINATE_M, le=MAX_GRAPH_COORDINATE_M)]],
@@ -170,6 +187,7 @@ class DetectedObject(msgspec.Struct):
     score: Probability
     class_probabilities: Distribution
     colour_lab: Colour = msgspec.UNSET
+    embedding: Embedding = msgspec.UNSET
 
 
 class FrameGraphMessage(Message, kw_only=True):
@@ -181,6 +199,7 @@ class FrameGraphMessage(Message, kw_only=True):
     predicates: Names
     objects: Annotated[list[DetectedObject], msgspec.Meta(max_length=MAX_OBJECTS)]
     relations: Annotated[list[RelationLogits], msgspec.Meta(max_length=MAX_RELATIONS)]
+    embedding_model: Model = msgspec.UNSET
 
 
 class LiftedObject(msgspec.Struct):
@@ -211,6 +230,7 @@ class LiftedObject(msgspec.Struct):
         ),
     ] = b""
     colour_lab: Colour = msgspec.UNSET
+    embedding: Embedding = msgspec.UNSET
 
 
 class DepthGridState(msgspec.Struct, frozen=True):
@@ -241,6 +261,7 @@ class LocalGraphMessage(Message, kw_only=True):
     relations: Annotated[list[RelationLogits], msgspec.Meta(max_length=MAX_RELATIONS)]
     drops: Annotated[dict[Name, NonNegative], msgspec.Meta(max_length=MAX_OBJECTS)] = {}
     depth_grid: Union[DepthGridState, None] = None
+    embedding_model: Model = msgspec.UNSET
 
 
 class PairEvidence(msgspec.Struct):
@@ -463,12 +484,34 @@ class SceneGraphUpdateMessage(Message, kw_only=True):
     up: Up = msgspec.UNSET
 
 
+class NodeEmbedding(msgspec.Struct, frozen=True, gc=False):
+    """What an object looks like, from all viewpoints."""
+
+    id: NodeId
+    vector: Vector16
+
+
+class EmbeddingsMessage(Message, kw_only=True):
+    """deworldsg/embeddings: embeddings of objects of the graph; frame_id is the world's.
+
+    The first message to a new subscriber is whole. Others have what has changed since the last one;
+    a lost one leaves older vectors.
+    """
+
+    session: Session = msgspec.UNSET
+    whole: Annotated[bool, msgspec.Meta(description="replaces all that came before")]
+    model: Name
+    nodes: list[NodeEmbedding]
+    removed: Annotated[list[NodeId], msgspec.Meta(description="objects that have none any more")]
+
+
 MESSAGES: dict[str, type[Message]] = {
     "frame_graph": FrameGraphMessage,
     "local_graph": LocalGraphMessage,
     "relation_evidence": RelationEvidenceMessage,
     "scene_graph": SceneGraphMessage,
     "scene_graph_updates": SceneGraphUpdateMessage,
+    "embeddings": EmbeddingsMessage,
 }
 
 M = TypeVar("M", bound=Message)
@@ -488,7 +531,7 @@ def encode(message: Message) -> str:
 
 def max_bytes(kind: type[Message]) -> int:
     """Size of the largest message of this type that is read."""
-    is_graph = kind in (SceneGraphMessage, SceneGraphUpdateMessage)
+    is_graph = kind in (SceneGraphMessage, SceneGraphUpdateMessage, EmbeddingsMessage)
     return MAX_GRAPH_BYTES if is_graph else MAX_FRAME_BYTES
 
 
@@ -524,6 +567,12 @@ def decode(text: Union[str, bytes], kind: type[M], most_bytes: Optional[int] = N
             f"expected {known.name} version {known.version} or older",
         )
     checked_frame_id(message.frame_id)
+    if isinstance(message, EmbeddingsMessage):
+        try:
+            check_labels([message.model])
+            _check_once("node", [node.id for node in message.nodes])
+        except ValueError as error:
+            raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
     if isinstance(message, (SceneGraphMessage, SceneGraphUpdateMessage)):
         try:
             _check_graph(message)

@@ -18,6 +18,7 @@ from support.merging import (
     random_classes,
     random_colours,
     random_covariances,
+    random_embeddings,
     random_pose,
     seeds,
 )
@@ -85,6 +86,7 @@ def random_objects(rng: np.random.Generator, count: int) -> dict[str, Any]:
             rng.random(len(pairs)),
         ),
         "colours_lab": random_colours(rng.integers(0, 9, count), int(rng.integers(1000))),
+        "embeddings": random_embeddings(count, int(rng.integers(1000))),
     }
 
 
