@@ -42,6 +42,7 @@ from deworldsg_ros.client.objects import (
     relation_of,
     scene_object,
 )
+from deworldsg_ros.client.text_tower import embed_text
 from deworldsg_ros.graph.embeddings import Looks, embeddings_path, read_embeddings
 from deworldsg_ros.graph.extent import DEFAULT_UP
 from deworldsg_ros.graph.graph_files import GRAPH_FILE, read_graph
@@ -211,6 +212,10 @@ def cheapest_chain(
 Which = SceneObject | int | str
 
 
+NO_LOOKS = (
+    "no object of the graph has an embedding: set perception.embedder, or use a detector that "
+    "gives them; live, use SceneGraphClient(embeddings=True)"
+)
 # Characters of a name in an error.
 MOST_SHOWN = 60
 
@@ -536,16 +541,32 @@ class SceneGraph:
             ClientError: if no object has an embedding, or the vector does not fit.
         """
         if self.looks is None:
-            raise ClientError(
-                "no object of the graph has an embedding: use a detector or perception.embedder "
-                "that gives them; live, use SceneGraphClient(embeddings=True)"
-            )
+            raise ClientError(NO_LOOKS)
         try:
             ranked = self.looks.similar(vector)
         except ValueError as error:
             raise ClientError(str(error)) from error
         found = [(self[node_id], cosine) for node_id, cosine in ranked if node_id in self]
         return found[: max(k, 0)]
+
+    def like(
+        self, text: str, k: int = 5, *, model: str | None = None
+    ) -> list[tuple[SceneObject, float]]:
+        """The k objects that look most like a text, with the cosines, the best first.
+
+        A cosine is no probability: those of CLIP are from 0.2 to 0.35, those of SigLIP near 0.1.
+
+        Args:
+            text: e.g. "something to drink from".
+            k: greatest number of objects.
+            model: folder or hub id of the model of the embeddings, if it is not their name here.
+
+        Raises:
+            ClientError: without embeddings, torch, transformers, or the model in the local cache.
+        """
+        if self.looks is None:
+            raise ClientError(NO_LOOKS)
+        return self.similar(embed_text(model or self.looks.model, text), k)
 
     def explain(self, what: Which | Relation | tuple[Which, Which]) -> Explanation:
         """Why something is in the graph, or is not: an object, a relation, a pair, or a class."""

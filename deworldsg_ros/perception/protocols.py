@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -129,6 +130,17 @@ class Segmenter(Protocol):
         Returns:
             n masks, in the order of the boxes.
         """
+
+
+class Embedder(Protocol):
+    """Crops of objects to vectors."""
+
+    @property
+    def model_name(self) -> str:
+        """Name of the model, by which its texts can be found."""
+
+    def embed(self, crops: Sequence[UInt8]) -> Float32:
+        """(n, D) float32 vectors of n >= 1 crops, (h, w, 3) uint8 in RGB order each."""
 
 
 @dataclass(frozen=True)

@@ -243,6 +243,8 @@ REASONS: dict[str, str] = {
     "relation_head_error": "The relation head failed on an image. Its frame graph has no "
     "relations. Read the traceback in the log; if memory is short, choose a smaller checkpoint or "
     "another device.",
+    "embedder_error": "The embedder failed on an image. Its objects get no embeddings. Read the "
+    "traceback in the log; if memory is short, choose a smaller checkpoint or another device.",
     "world_model_error": "The world model failed on a clip. The clip gives no prediction. Read the "
     "message in the log; if memory is short, choose another device.",
     "nan_features": "The world model computed NaN or infinity for a clip. The clip gives no "

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from deworldsg_ros.client import ClientError, SceneGraph
+from deworldsg_ros.client.grammar import Condition, Pattern, Rank, Since, parse
 from deworldsg_ros.client.meanings import COLOURS, colour_name, colour_shares
-from deworldsg_ros.client.questions import Condition, Pattern, Rank, Since, ask, parse
+from deworldsg_ros.client.questions import ask
 
 ON_TABLE, NEAR_CUP = Condition("on", "table"), Condition("near", "cup")
 RED, PURPLE, ORANGE = (Condition(own_colour=name) for name in ("red", "purple", "orange"))
