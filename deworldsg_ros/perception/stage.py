@@ -340,7 +340,7 @@ SAME_BOX = 0.3
 CROP_MARGIN = 0.1
 
 
-class Turns:
+class EmbeddingQueue:
     """Chooses the objects of a frame to embed: those that waited longest, then the largest."""
 
     def __init__(self) -> None:
@@ -447,7 +447,7 @@ class Perception:
         embedder: Embedder | None = None,
     ) -> None:
         self.detectors = detectors
-        self._embedder, self._turns = embedder, Turns()
+        self._embedder, self._queue = embedder, EmbeddingQueue()
         self._detector = detector
         self._segmenter = segmenter
         self._relation_head = relation_head
@@ -562,7 +562,7 @@ class Perception:
         """Those of the embedder or the detector; None if there are none, or the embedder failed."""
         rows, vectors, model = np.arange(len(objects)), objects.embeddings, objects.embedding_model
         if self._embedder is not None:
-            rows = np.array(self._turns.choose(objects.boxes_xyxy, frame.stamp_ns), np.int64)
+            rows = np.array(self._queue.choose(objects.boxes_xyxy, frame.stamp_ns), np.int64)
             crops = [square_crop(frame.rgb, objects.boxes_xyxy[row]) for row in rows]
             try:
                 vectors = self._embedder.embed(crops) if crops else None
