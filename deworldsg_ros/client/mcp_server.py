@@ -256,7 +256,7 @@ def _about(graph: SceneGraph) -> dict[str, Any]:
 
 
 def _short(item: SceneObject) -> dict[str, Any]:
-    names = ("id", "label", "probability", "sure", "position_m", "size_m", "observations")
+    names = ("id", "label", "probability", "sure", "position_m", "size_m", "colour", "observations")
     values = item.to_dict()
     return {name: values[name] for name in names}
 
