@@ -77,6 +77,13 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     segmenter_path: Annotated[
         str, option("checkpoint of sam2, sam3 or sam: a folder, or a hub id in the local cache")
     ] = ""
+    embedder: Annotated[
+        str,
+        option(
+            "CLIP, SigLIP or SigLIP 2 that embeds two objects a second, for questions by looks: a "
+            "folder, or a hub id in the local cache; empty = none"
+        ),
+    ] = ""
     device: Annotated[
         Literal["auto", "cpu", "cuda"],
         option(

@@ -233,6 +233,7 @@ class Pipeline:
         assert self.builder is not None
         with timed(self.times_s["merging"]):
             node_ids = self.builder.integrate(local)
+        self.drops.update(self.builder.refused.keys())
         with timed(self.times_s["relations"]):
             self.builder.add_evidence(self.relations.observe(local, frame.rgb))
             for evidence in self.relations.drain():

@@ -74,6 +74,7 @@ CATALOGUE = {
             *("facebook", f"{WORLD_MODEL}: dinov2", "apache-2.0"),
             *("dinov2-small", "dinov2-base", "dinov2-large"),
         ),
+        *_published("google", "perception.embedder", "apache-2.0", "siglip2-base-patch16-224"),
     )
 }
 # Names that stand for several models. The embedded models are part of the package.
@@ -164,6 +165,9 @@ def missing_perception(config: PerceptionConfig) -> list[str]:
         title, name = SEGMENTERS[config.segmenter]
         advice = _get(config.segmenter_path, name)
         lines.append(_line(title, "perception.segmenter_path", config.segmenter_path, advice))
+    if config.embedder and _is_missing(config.embedder):
+        advice = _get(config.embedder, "siglip2-base-patch16-224")
+        lines.append(_line("SigLIP or CLIP", "perception.embedder", config.embedder, advice))
     return lines
 
 

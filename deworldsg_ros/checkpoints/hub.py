@@ -126,6 +126,8 @@ USED_FILES = (
     "model.safetensors.index.json",
     "pre*processor_config.json",
     "processor_config.json",
+    # Of texts.
+    *("tokenizer*.json", "special_tokens_map.json", "vocab.json", "merges.txt"),
     "LICENSE*",
     "README.md",
 )

@@ -16,7 +16,7 @@ import msgspec
 
 from deworldsg_ros.base.plugins import PluginError, load_plugin
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.perception.protocols import Detector, RelationHead, Segmenter
+from deworldsg_ros.perception.protocols import Detector, Embedder, RelationHead, Segmenter
 from deworldsg_ros.perception.stage import Perception
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
@@ -88,6 +88,13 @@ def _egtr(config: PerceptionConfig, detector: Detector) -> RelationHead:
     return EgtrRelationHead(config, detector)
 
 
+def _embedder(config: PerceptionConfig) -> Embedder:
+    with _torch("perception.embedder", config.embedder, config):
+        from deworldsg_ros.perception.backends.embedder import ImageEmbedder
+
+    return ImageEmbedder(config)
+
+
 DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
     "nanodet": _nanodet,
     "rtdetr": _rtdetr,
@@ -141,7 +148,13 @@ def build_perception(
         detector = make_detector(config)
     head = make_head(config, detector)
     return Perception(
-        detector, make_segmenter(config), head, config, world_up=world_up, detectors=detectors
+        detector,
+        make_segmenter(config),
+        head,
+        config,
+        world_up=world_up,
+        detectors=detectors,
+        embedder=_embedder(config) if config.embedder else None,
     )
 
 

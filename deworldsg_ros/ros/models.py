@@ -43,7 +43,7 @@ from deworldsg_ros.wire import messages as wire
 # Every call of a model runs in a thread of its own and has a time limit. A model that fails again
 # and again is loaded again, on the CPU. Faults can be injected, to try what the robot does then.
 
-PARTS = ("detector", "segmenter", "relation_head", "world_model")
+PARTS = ("detector", "segmenter", "relation_head", "embedder", "world_model")
 # The slowest step of perception, a large network on a CPU, takes seconds.
 PERCEPTION_LIMIT_S = 30.0
 # A clip of the largest world model takes a minute on a CPU.
@@ -58,7 +58,7 @@ HUNG_LIMITS = 2
 # /diagnostics warns about a call that takes longer.
 SLOW_S = 5.0
 # Methods whose result a stage waits for.
-CALLS = ("detect", "segment", "relate", "predict")
+CALLS = ("detect", "segment", "relate", "predict", "embed")
 
 
 class ModelError(Exception):

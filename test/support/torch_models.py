@@ -7,6 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 transformers = pytest.importorskip("transformers")
+tokenizers = pytest.importorskip("tokenizers")
 
 from safetensors.torch import save_file  # noqa: E402  after the guards
 
@@ -274,4 +275,40 @@ def save_dfine(folder):
     model.save_pretrained(folder)
     preprocessing = {"size": {"height": 64, "width": 64}, "do_normalize": False}
     (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
+    return model
+
+
+# Of CLIP and SigLIP: words of their texts, and sizes of both towers.
+WORDS = ["<pad>", "<unk>", "<s>", "</s>", "a", "cup", "red", "sofa", "to", "drink", "from"]
+TOWER = {
+    **{"hidden_size": 16, "intermediate_size": 24, "num_attention_heads": 2},
+    "num_hidden_layers": 2,
+}
+
+
+def save_two_towers(folder, family="clip"):
+    """A CLIP or SigLIP with random weights, with a tokenizer of a few words; the whole model."""
+    torch.manual_seed(0)
+    text = {**TOWER, "vocab_size": len(WORDS), "max_position_embeddings": 9}
+    text |= {"pad_token_id": 0, "bos_token_id": 2, "eos_token_id": 3}
+    vision = {**TOWER, "image_size": 32, "patch_size": 8}
+    if family == "clip":
+        config = transformers.CLIPConfig(text_config=text, vision_config=vision, projection_dim=12)
+        model = transformers.CLIPModel(config)
+    else:
+        config = transformers.SiglipConfig(text_config=text, vision_config=vision)
+        model = transformers.SiglipModel(config)
+    model = _randomised(model.eval())
+    model.save_pretrained(folder)
+    size = {"shortest_edge": 32} if family == "clip" else {"height": 32, "width": 32}
+    content = {"size": size, "do_normalize": True, **IMAGENET}
+    (folder / "preprocessor_config.json").write_text(json.dumps(content))
+    words = {word: index for index, word in enumerate(WORDS)}
+    core = tokenizers.Tokenizer(tokenizers.models.WordLevel(words, unk_token="<unk>"))
+    core.pre_tokenizer = tokenizers.pre_tokenizers.Whitespace()
+    core.post_processor = tokenizers.processors.TemplateProcessing(
+        single="<s> $A </s>", special_tokens=[("<s>", 2), ("</s>", 3)]
+    )
+    special = {"unk_token": "<unk>", "pad_token": "<pad>", "eos_token": "</s>", "bos_token": "<s>"}
+    transformers.PreTrainedTokenizerFast(tokenizer_object=core, **special).save_pretrained(folder)
     return model

@@ -43,6 +43,8 @@ class Preprocessing:
             content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
             content = content.get("image_processor", content)
             size = content.get("size", {})
+            if isinstance(size, int):
+                size = {"height": size, "width": size}
             height = int(size.get("height", default.height))
             width = int(size.get("width", default.width))
             if not content.get("do_normalize", False):
