@@ -246,7 +246,7 @@ class SentDetection(msgspec.Struct):
         bytes,
         msgspec.Meta(
             max_length=2 * MAX_EMBEDDING,
-            description="float16 little-endian, base64, as long for all objects; empty = none",
+            description="float16 little-endian, base64, as long for all objects, or empty",
         ),
     ] = b""
 
