@@ -30,8 +30,8 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     detector: Annotated[
         str,
         option(
-            "detector: nanodet (shipped weights, COCO classes), rtdetr (RT-DETR, the paper's, "
-            "RT-DETRv2 or D-FINE), or a plug-in"
+            "detector: nanodet (shipped weights, COCO classes), transformers (D-FINE, RF-DETR and "
+            "others of fixed classes; rtdetr, the paper's, is another name of it), or a plug-in"
         ),
     ] = "nanodet"
     segmenter: Annotated[
@@ -72,7 +72,7 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = True
     detector_path: Annotated[
         str,
-        option("checkpoint of rtdetr and egtr: a folder, or a hub id in the local cache"),
+        option("checkpoint of the detector and egtr: a folder, or a hub id in the local cache"),
     ] = ""
     segmenter_path: Annotated[
         str, option("checkpoint of sam2, sam3 or sam: a folder, or a hub id in the local cache")

@@ -48,7 +48,7 @@ def _dfine(size: str, ap: float) -> list[Published]:
     return found[: 1 if size == "nano" else 2]
 
 
-DETECTOR, SEGMENTER = "perception.detector: rtdetr", "perception.segmenter"
+DETECTOR, SEGMENTER = "perception.detector: transformers", "perception.segmenter"
 WORLD_MODEL = "relations.world_model"
 CATALOGUE = {
     model.name: model
@@ -109,7 +109,10 @@ def is_complete(folder: Path) -> bool:
 # --- The checkpoints that a configuration needs, and how to get the missing ones. Needs no torch.
 
 # How to get the checkpoint of a backend: title, name for `deworldsg models get`.
-DETECTORS = {"rtdetr": ("RT-DETR", "rtdetr_r50vd")}
+DETECTORS = {
+    "transformers": ("detector", "dfine-small-obj365"),
+    "rtdetr": ("RT-DETR", "rtdetr_r50vd"),
+}
 SEGMENTERS = {
     "sam2": ("SAM 2", "sam2.1-hiera-tiny"),
     "sam3": ("SAM 3", "sam3"),

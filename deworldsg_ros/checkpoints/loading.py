@@ -13,22 +13,19 @@ from typing import Any
 
 import torch
 import transformers
-from transformers import (
-    DFineForObjectDetection,
-    RTDetrForObjectDetection,
-    RTDetrV2ForObjectDetection,
-)
 
 from deworldsg_ros.checkpoints.catalogue import is_hub_id
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 
-# --- Detector classes of `transformers`, and the file name of the relation head.
+# --- Detectors of `transformers`, and the file name of the relation head.
 
-# Detectors, by the model type in config.json.
-DETECTORS: dict[str, Any] = {
-    "rt_detr": RTDetrForObjectDetection,
-    "rt_detr_v2": RTDetrV2ForObjectDetection,
-    "d_fine": DFineForObjectDetection,
+# Detectors of `AutoModelForObjectDetection` that transformers reads alike, by the model type in
+# config.json: a sigmoid for each class, or a softmax with "no object" as the last class. The others
+# find text and layouts of documents.
+DETECTORS = {
+    **dict.fromkeys(("rt_detr", "rt_detr_v2", "d_fine", "deimv2", "rf_detr", "lw_detr"), "sigmoid"),
+    **dict.fromkeys(("conditional_detr", "dab-detr", "deformable_detr"), "sigmoid"),
+    **dict.fromkeys(("detr", "table-transformer", "yolos"), "softmax"),
 }
 # File of the relation head, beside the detector's weights.
 HEAD_FILE = "egtr_head.safetensors"

@@ -68,7 +68,7 @@ def get_models(names: list[str], into: Path, console: Console) -> None:
             hub.fetch(model, folder, lambda line: console.print(f"  {line}"))
             if published.purpose == DETECTOR:
                 console.print(
-                    "use it: --set perception.detector=rtdetr --set "
+                    "use it: --set perception.detector=transformers --set "
                     f"perception.detector_path={folder}"
                 )
     if "paper" in names:
@@ -209,7 +209,7 @@ def _perception_of(name: str, into: Path) -> PerceptionConfig:
     if name not in CATALOGUE and not (folder.is_dir() or is_hub_id(name)):
         known = ", ".join([*plugins("perception.detector"), *_detectors()])
         raise ConfigurationError(f"detector '{name}': expected a folder, or one of {known}")
-    return PerceptionConfig(detector="rtdetr", detector_path=str(folder))
+    return PerceptionConfig(detector="transformers", detector_path=str(folder))
 
 
 def _detectors() -> list[str]:

@@ -30,11 +30,11 @@ def _nanodet(config: PerceptionConfig) -> Detector:
     return NanoDetDetector(threads=config.threads)
 
 
-def _rtdetr(config: PerceptionConfig) -> Detector:
+def _transformers(config: PerceptionConfig) -> Detector:
     with _torch("perception.detector", config.detector, config):
-        from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
+        from deworldsg_ros.perception.backends.closed_set import ClosedSetDetector
 
-    return RtDetrDetector(config)
+    return ClosedSetDetector(config)
 
 
 def _rgbd(config: PerceptionConfig) -> Segmenter:
@@ -77,14 +77,16 @@ def _geometric(config: PerceptionConfig, detector: Detector) -> RelationHead:
 
 def _egtr(config: PerceptionConfig, detector: Detector) -> RelationHead:
     with _torch("perception.relation_head", config.relation_head, config):
-        from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead
+        from deworldsg_ros.perception.backends.closed_set import EgtrRelationHead
 
     return EgtrRelationHead(config, detector)
 
 
 DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
     "nanodet": _nanodet,
-    "rtdetr": _rtdetr,
+    "transformers": _transformers,
+    # The same, by the name of the paper's detector.
+    "rtdetr": _transformers,
 }
 # Torch has one setting of its threads for the thread that sets it, and a GPU takes one frame after
 # the other anyway.

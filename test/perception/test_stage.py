@@ -186,7 +186,7 @@ def test_an_unknown_backend_is_refused(settings, offender):
     ("field", "name"), [("detector", "rtdetr"), ("segmenter", "sam2"), ("segmenter", "sam")]
 )
 def test_without_torch_the_error_names_the_package_to_install(field, name, monkeypatch):
-    for module in ("rtdetr", "sam"):
+    for module in ("closed_set", "sam"):
         monkeypatch.setitem(sys.modules, f"deworldsg_ros.perception.backends.{module}", None)
     with pytest.raises(ConfigurationError, match=f"'{name}'.*pip install torch"):
         build_perception(PerceptionConfig(**{field: name}))
