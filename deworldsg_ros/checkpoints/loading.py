@@ -161,6 +161,18 @@ class CheckpointSource:
             )
         return model.eval().requires_grad_(False)
 
+    def tokenizer(self) -> Any:
+        """The tokenizer of a checkpoint that reads text; raises ConfigurationError."""
+        try:
+            return transformers.AutoTokenizer.from_pretrained(
+                self.name, local_files_only=self.local_files_only
+            )
+        except Exception as error:  # transformers raises errors of many types
+            raise ConfigurationError(
+                f"{self.parameter} '{self.name}' has no tokenizer ({first_line(error)}), expected "
+                "tokenizer.json or its parts: download the checkpoint again"
+            ) from error
+
     def _cannot_load(self, error: Exception) -> str:
         reason = f"{self.parameter} '{self.name}' cannot be loaded ({first_line(error)})"
         folder = "a folder with config.json and model.safetensors of transformers' format"

@@ -37,6 +37,13 @@ def _transformers(config: PerceptionConfig) -> Detector:
     return ClosedSetDetector(config)
 
 
+def _open_vocabulary(config: PerceptionConfig) -> Detector:
+    with _torch("perception.detector", config.detector, config):
+        from deworldsg_ros.perception.backends.open_vocabulary import OpenVocabularyDetector
+
+    return OpenVocabularyDetector(config)
+
+
 def _rgbd(config: PerceptionConfig) -> Segmenter:
     from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 
@@ -87,6 +94,7 @@ DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
     "transformers": _transformers,
     # The same, by the name of the paper's detector.
     "rtdetr": _transformers,
+    "open_vocabulary": _open_vocabulary,
 }
 # Torch has one setting of its threads for the thread that sets it, and a GPU takes one frame after
 # the other anyway.

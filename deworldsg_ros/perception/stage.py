@@ -338,6 +338,7 @@ class Perception:
         self._detector = detector
         self._segmenter = segmenter
         self._relation_head = relation_head
+        self._words = config.words
         self._refine = config.refine_detections
         self._up = UpEstimator(world_up)
         self._uprighter = Uprighter(world_up) if config.refine_detections else None
@@ -346,8 +347,31 @@ class Perception:
         self.vocabulary = _vocabulary(detector.classes, relation_head.predicates)
         self.configure(config)
 
+    def check(self, config: PerceptionConfig) -> None:
+        """Raise ConfigurationError for words that the detector cannot look for."""
+        if hasattr(self._detector, "check_words"):
+            self._detector.check_words(config.words)
+        elif config.words:
+            raise ConfigurationError(
+                f"perception.words needs a detector of free text, and perception.detector is "
+                f"'{config.detector}': set it to open_vocabulary, with a perception.detector_path"
+            )
+
+    def take_over(self, other: Perception, config: PerceptionConfig) -> None:
+        """Keep the columns of another perception's classes, which this one replaces."""
+        if hasattr(self._detector, "use_words"):
+            self._detector.use_words(config.words, other.vocabulary.classes)
+
     def configure(self, config: PerceptionConfig) -> None:
-        """Use another `score_threshold` and `max_relations` from the next frame on."""
+        """Use other `score_threshold`, `max_relations` and `words` from the next frame on.
+
+        Raises:
+            ConfigurationError: as `check`; nothing changes.
+        """
+        self.check(config)
+        if config.words != self._words:
+            self._detector.use_words(config.words)  # type: ignore[attr-defined]
+            self._words = config.words
         self._max_relations = config.max_relations
         self.score_threshold = (
             self._detector.default_score_threshold
@@ -450,7 +474,12 @@ class Perception:
     def segment(
         self, frame: RgbdFrame, objects: Detections, weak: Detections
     ) -> list[MaskPatch] | None:
-        """A mask of each object, without the pixels of `weak`; None if the segmenter failed."""
+        """A mask of each object: the detector's, or the segmenter's without the pixels of `weak`.
+
+        None if the segmenter failed.
+        """
+        if objects.masks is not None:
+            return list(objects.masks)
         boxes_xyxy = np.concatenate([objects.boxes_xyxy, weak.boxes_xyxy])
         try:
             masks = self._segmenter.segment(frame.rgb, frame.depth_m, frame.intrinsics, boxes_xyxy)

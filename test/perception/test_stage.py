@@ -2,6 +2,7 @@
 
 import sys
 from collections import Counter
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -28,6 +29,7 @@ from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.ros.health import REASONS
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.scene.frame_graph import MaskPatch
 from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES
 
 
@@ -86,6 +88,21 @@ def test_a_table_and_a_cup():
     # Boxes are clipped to the image.
     found = perceive([[-20, -30, 60, 300]], [0], [0.9])
     assert found.frame_graph.boxes_xyxy.tolist() == [[0, 0, 60, HEIGHT - 1]]
+
+
+def test_the_masks_of_a_detector_are_used_as_they_are():
+    class MaskingDetector(ListedDetector):
+        def detect(self, rgb, score_threshold):
+            found = super().detect(rgb, score_threshold)
+            masks = (MaskPatch(0, 0, OWNER == 1), MaskPatch(0, 0, OWNER == 2))
+            return replace(found, masks=masks[: len(found)])
+
+    made = stage(MaskingDetector([TABLE, CUP], [0, 1], [0.6, 0.9]))
+    made._segmenter = None
+    found = made.perceive(FRAME)
+    assert found.frame_graph.scores.tolist() == [0.9, 0.6]
+    for label, value in ((1, 2), (2, 1)):
+        assert np.array_equal(found.instances == label, value == OWNER)
 
 
 VIEW = [0.03 * WIDTH, 0.03 * HEIGHT, 0.97 * WIDTH, 0.97 * HEIGHT]

@@ -62,10 +62,11 @@ def random_rtdetr(version=1, **changes):
         if version == 1
         else transformers.RTDetrV2ForObjectDetection
     )
-    return _randomised(family(config).eval())
+    return randomised(family(config).eval())
 
 
-def _randomised(model):
+def randomised(model):
+    """The network with outputs that differ. The default initialisation makes them equal."""
     with torch.no_grad():
         for name, value in model.named_parameters():
             if value.ndim > 1:
@@ -171,7 +172,7 @@ def save_sam2(folder, video=False):
     return save_segmenter(folder, family, sam2_config(video))
 
 
-def save_sam3(folder, video=False):
+def save_sam3(folder, video=False, text=None):
     """Save a small SAM 3: its tracker alone, or detector and tracker as published."""
     vision = {
         "backbone_config": {
@@ -191,7 +192,7 @@ def save_sam3(folder, video=False):
         config = transformers.Sam3TrackerConfig(**tracker)
         return save_segmenter(folder, transformers.Sam3TrackerModel, config)
     small = {"hidden_size": 32, "intermediate_size": 32, "num_attention_heads": 2}
-    text = {"num_hidden_layers": 1, "projection_dim": 32, "vocab_size": 99}
+    text = {"num_hidden_layers": 1, "projection_dim": 32, "vocab_size": 99, **(text or {})}
     config = transformers.Sam3VideoConfig(
         detector_config=transformers.Sam3Config(
             vision_config=transformers.Sam3VisionConfig(**vision),
@@ -270,7 +271,7 @@ def save_dfine(folder):
         id2label=dict(enumerate(CLASSES)),
         label2id={name: index for index, name in enumerate(CLASSES)},
     )
-    model = _randomised(transformers.DFineForObjectDetection(config).eval())
+    model = randomised(transformers.DFineForObjectDetection(config).eval())
     model.save_pretrained(folder)
     preprocessing = {"size": {"height": 64, "width": 64}, "do_normalize": False}
     (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
@@ -309,7 +310,7 @@ def save_closed_set(folder, family):
         config = transformers.RfDetrConfig(
             **{**shared, **heads, "backbone_config": dinov2, "c2f_num_blocks": 1}
         )
-    model = _randomised(transformers.AutoModelForObjectDetection.from_config(config).eval())
+    model = randomised(transformers.AutoModelForObjectDetection.from_config(config).eval())
     for name, part in model.named_modules():
         if "class" in name and getattr(part, "out_features", 0) in (len(names), len(names) + 1):
             with torch.no_grad():  # no training ever asked for it

@@ -14,6 +14,7 @@ import onnxruntime
 from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt8, pairwise_iou, softmax
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.frame_graph import MaskPatch
 from deworldsg_ros.scene.vocabulary import COCO_CLASSES
 
 # --- Non-maximum suppression that keeps track of the suppressed boxes.
@@ -221,6 +222,7 @@ def combine(
     class_scores: Float64,
     score_threshold: float,
     calibration: Callable[[Float64], Float64] = CALIBRATION,
+    masks: Sequence[MaskPatch] | None = None,
 ) -> Detections:
     """Candidates → objects: suppression, and combined class scores of nearly identical boxes.
 
@@ -229,9 +231,10 @@ def combine(
 
     Args:
         boxes_xyxy: (k, 4) pixels.
-        class_scores: (k, 80) sigmoid scores.
+        class_scores: (k, C) sigmoid scores.
         score_threshold: minimum score of an object.
-        calibration: scores (n, 80) to distributions.
+        calibration: scores (n, C) to distributions.
+        masks: k masks, of which the objects keep theirs; None = none.
     """
     best = class_scores.max(axis=1) if len(class_scores) else np.zeros(0)
     # A box never suppresses a better one.
@@ -249,4 +252,5 @@ def combine(
     near = pairwise_iou(boxes_xyxy[kept], boxes_xyxy) > ANY_CLASS_IOU
     for row in range(len(kept)):
         evidence[row] = class_scores[near[row]].max(axis=0)
-    return Detections(boxes_xyxy[kept], calibration(evidence), best[kept])
+    kept_masks = None if masks is None else tuple(masks[row] for row in kept)
+    return Detections(boxes_xyxy[kept], calibration(evidence), best[kept], masks=kept_masks)
