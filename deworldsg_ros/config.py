@@ -43,7 +43,8 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         option(
             "detector: nanodet (shipped weights, COCO classes), transformers (D-FINE, RF-DETR and "
             "others of fixed classes; rtdetr, the paper's, is another name of it), open_vocabulary "
-            "(OWLv2, Grounding DINO, OmDet-Turbo or SAM 3 look for `words`), or a plug-in"
+            "(OWLv2, Grounding DINO, OmDet-Turbo or SAM 3 look for `words`), onnx (exported by "
+            "`deworldsg models export`, runs without torch), or a plug-in"
         ),
     ] = "nanodet"
     segmenter: Annotated[

@@ -174,6 +174,7 @@ DETECTORS = {
     "transformers": ("detector", "dfine-small-obj365"),
     "rtdetr": ("RT-DETR", "rtdetr_r50vd"),
     "open_vocabulary": ("detector of free text", "grounding-dino-tiny"),
+    "onnx": ("exported detector", "dfine-small-obj365"),
 }
 SEGMENTERS = {
     "sam2": ("SAM 2", "sam2.1-hiera-tiny"),
@@ -204,6 +205,25 @@ def detector_of(folder: Path) -> str:
     except (OSError, ValueError, KeyError, TypeError):
         is_text = False
     return "open_vocabulary" if is_text else "transformers"
+
+
+def unused_detector(config: PerceptionConfig, into: Path = MODELS_FOLDER) -> tuple[str, str]:
+    """Folder of a stronger detector and the options that use it; empty if there is none.
+
+    Args:
+        config: of a run; a detector is unused if this names the embedded one.
+        into: folder of the models.
+    """
+    if config.detector != PerceptionConfig().detector or not into.is_dir():
+        return "", ""
+    for folder in sorted(into.iterdir()):
+        backend = detector_of(folder)
+        known = folder.name in CATALOGUE and CATALOGUE[folder.name].purpose == DETECTOR
+        if backend == "onnx" or (known and is_complete(folder)):
+            return str(folder), (
+                f"--set perception.detector={backend} --set perception.detector_path={folder}"
+            )
+    return "", ""
 
 
 def is_hub_id(name: str) -> bool:
@@ -240,7 +260,9 @@ def missing_perception(config: PerceptionConfig) -> list[str]:
     lines = []
     if config.detector in DETECTORS and _is_missing(config.detector_path):
         title, name = DETECTORS[config.detector]
-        if config.relation_head == "egtr":
+        if config.detector == "onnx":
+            advice = "run `deworldsg models export NAME {folder}`"
+        elif config.relation_head == "egtr":
             (_, title, advice), _ = NOT_ON_THE_HUB
         else:
             advice = _get(config.detector_path, name)

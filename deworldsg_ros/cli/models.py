@@ -35,6 +35,7 @@ from deworldsg_ros.checkpoints.hub import SUMS_FILE, Hub, ParameterHeader, read_
 from deworldsg_ros.cli.configuration import EXIT_USAGE
 from deworldsg_ros.client.meanings import is_class
 from deworldsg_ros.config import Config, PerceptionConfig
+from deworldsg_ros.scene.arrays import UInt8
 from deworldsg_ros.scene.errors import (
     ConfigurationError,
     DeWorldSGError,
@@ -209,6 +210,61 @@ def _measure(name: str, recording: Path, into: Path, words: tuple[str, ...]) -> 
     return replace(done, found=(found.found, found.objects), precision=precision)
 
 
+# Images that tell how large the activations are: from so many frames, every so manieth.
+CALIBRATION_IMAGES, CALIBRATION_STEP = 64, 10
+
+
+def export_model(
+    name: str, out: Path, recording: Path | None, into: Path, console: Console
+) -> None:
+    """Export a detector as ONNX; see `deworldsg models export`.
+
+    Args:
+        name: of the catalogue, a folder, or a hub id.
+        out: folder to write.
+        recording: images for 8 bits; None = float32.
+        into: folder of the models.
+        console: terminal.
+
+    Raises:
+        DeWorldSGError: a detector, a package or a recording that cannot be used.
+    """
+    try:
+        from deworldsg_ros.perception.export import export_detector
+    except ImportError as error:
+        raise ConfigurationError(
+            f"the export needs torch and transformers ({error}): pip install "
+            "torch onnx onnxscript 'transformers>=5.23'"
+        ) from error
+    images = [] if recording is None else _images(recording)
+    path = into / name if name in CATALOGUE else name
+    with console.status(f"{name} …"):
+        made = export_detector(str(path), out, images)
+    bits = "8 bits in its convolutions" if images else "float32"
+    console.print(
+        f"{out}: {made.classes} classes, {made.bytes / 1e6:.1f} MB, {bits}; largest difference of "
+        f"a score to torch {made.difference:.4f}\n"
+        f"use it: --set perception.detector=onnx --set perception.detector_path={out}"
+    )
+
+
+def _images(recording: Path) -> list[UInt8]:
+    """Images at equal distances in a recording of any length, at most CALIBRATION_IMAGES."""
+    from deworldsg_ros.recordings.recording import Recording, open_source
+
+    images: list[UInt8] = []
+    step = 1
+    with closing(open_source(recording)) as source:
+        for number, frame in enumerate(Recording(source).frames()):
+            if number % step == 0:
+                images.append(frame.rgb)
+            if len(images) > CALIBRATION_IMAGES:
+                images, step = images[::2], 2 * step
+    if not images:
+        raise RecordingError(f"recording {recording}: not one frame could be used")
+    return images
+
+
 def _perception_of(name: str, into: Path, words: tuple[str, ...]) -> PerceptionConfig:
     if name == "embedded":
         return PerceptionConfig()
@@ -344,6 +400,27 @@ def measure_command(
     listed = tuple(word.strip() for word in words.split(",") if word.strip())
     with _terminal() as console:
         measure_detectors(names[:-1], Path(names[-1]), into, listed, console)
+
+
+@app.command("export")
+def export_command(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="a name of `models list`, a folder, or a hub id")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write")],
+    int8: Annotated[
+        Optional[Path],
+        typer.Option(
+            "--int8",
+            metavar="RECORDING",
+            help="8 bits in the convolutions, for images like those of a recording",
+        ),
+    ] = None,
+    into: IntoFolder = MODELS_FOLDER,
+) -> None:
+    """Export a detector of fixed classes as ONNX, which runs without torch."""
+    with _terminal() as console:
+        export_model(name, out, int8, into, console)
 
 
 @app.command()

@@ -44,6 +44,12 @@ def _open_vocabulary(config: PerceptionConfig) -> Detector:
     return OpenVocabularyDetector(config)
 
 
+def _onnx(config: PerceptionConfig) -> Detector:
+    from deworldsg_ros.perception.backends.onnx_detector import OnnxDetector
+
+    return OnnxDetector(config)
+
+
 def _rgbd(config: PerceptionConfig) -> Segmenter:
     from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 
@@ -95,10 +101,11 @@ DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
     # The same, by the name of the paper's detector.
     "rtdetr": _transformers,
     "open_vocabulary": _open_vocabulary,
+    "onnx": _onnx,
 }
 # Torch has one setting of its threads for the thread that sets it, and a GPU takes one frame after
 # the other anyway.
-THREAD_SAFE_DETECTORS = {"nanodet"}
+THREAD_SAFE_DETECTORS = {"nanodet", "onnx"}
 SEGMENTERS: dict[str, Callable[[PerceptionConfig], Segmenter]] = {
     "rgbd": _rgbd,
     "sam2": _sam2,

@@ -34,7 +34,7 @@ from deworldsg_ros.checkpoints.loading import (
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.backends.image_tensors import Preprocessing
 from deworldsg_ros.perception.protocols import Detections, Detector, SegmentedObjects
-from deworldsg_ros.scene.arrays import Float64, Int64, UInt8
+from deworldsg_ros.scene.arrays import Float64, Int64, UInt8, corners_of
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import Relations
 from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
@@ -255,9 +255,7 @@ def _use_layers(model: Any, used: int, source: CheckpointSource) -> None:
 
 def _pixel_boxes(boxes_cxcywh: Float64, width: int, height: int) -> Any:
     """Centre, width and height in [0, 1] to corners in pixels, pixel centres at integers."""
-    centres, halves = boxes_cxcywh[:, :2], boxes_cxcywh[:, 2:] / 2
-    corners = np.hstack([centres - halves, centres + halves])
-    return corners * [width, height, width, height] - 0.5
+    return corners_of(boxes_cxcywh) * [width, height, width, height] - 0.5
 
 
 def _normalised(probabilities: Float64) -> Any:

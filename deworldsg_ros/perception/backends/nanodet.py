@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -142,14 +142,7 @@ class NanoDetDetector:
             raise ConfigurationError(
                 f"NanoDet weights {weights}: no such file, install the package again"
             )
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        # Spinning threads would keep cores busy between frames, which other nodes need.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        self._session = onnxruntime.InferenceSession(
-            str(weights), options, providers=["CPUExecutionProvider"]
-        )
+        self._session = open_session(weights, threads)
         nothing = np.zeros((1, INPUT_SIZE, INPUT_SIZE, 4), np.uint8)
         self._tables = Tables(*self._session.run(list(Tables._fields), {"pixels": nothing}))
 
@@ -166,6 +159,16 @@ class NanoDetDetector:
         height, width = rgb.shape[:2]
         # Pixel centres are at integers here, and at halves in the network.
         return np.clip(boxes / scale - 0.5, -0.5, [width - 0.5, height - 0.5] * 2), class_scores
+
+
+def open_session(network: Path, threads: int) -> Any:
+    """A network on the CPU; `threads` 0 = all cores."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    # Spinning threads would keep cores busy between frames, which other nodes need.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return onnxruntime.InferenceSession(str(network), options, providers=["CPUExecutionProvider"])
 
 
 def letterbox(rgb: UInt8, input_codes: UInt8) -> tuple[UInt8, float]:

@@ -26,7 +26,7 @@ from deworldsg_ros.perception.backends.image_tensors import Preprocessing, resiz
 from deworldsg_ros.perception.backends.nanodet import SoftmaxCalibration, combine
 from deworldsg_ros.perception.backends.sam import as_patch
 from deworldsg_ros.perception.protocols import Detections
-from deworldsg_ros.scene.arrays import Float64, Int64, UInt8
+from deworldsg_ros.scene.arrays import Float64, Int64, UInt8, corners_of
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import MaskPatch
 from deworldsg_ros.scene.limits import MAX_NAMES, check_names
@@ -308,9 +308,7 @@ def _candidates(
     """Boxes (k, 4) in [0, 1] and logits (k, W) as candidates in an image of this size."""
     require_finite(logits, "detector_error", "the class logits")
     require_finite(boxes_cxcywh, "detector_error", "the boxes")
-    boxes = boxes_cxcywh.double().cpu().numpy()
-    centres, halves = boxes[:, :2], boxes[:, 2:] / 2
-    corners = np.hstack([centres - halves, centres + halves])
+    corners = corners_of(boxes_cxcywh.double().cpu().numpy())
     scores = logits.float().sigmoid().double().cpu().numpy()
     return Candidates(corners * [width, height, width, height] - 0.5, scores)
 
