@@ -275,6 +275,8 @@ def _perception_of(name: str, into: Path, words: tuple[str, ...]) -> PerceptionC
         known = ", ".join([*plugins("perception.detector"), *_detectors()])
         raise ConfigurationError(f"detector '{name}': expected a folder, or one of {known}")
     backend = detector_of(folder)
+    if backend == "open_vocabulary" and not words:
+        raise ConfigurationError(f"detector '{name}' looks for words: give --words 'mug, drill'")
     words = words if backend == "open_vocabulary" else ()
     return PerceptionConfig(detector=backend, detector_path=str(folder), words=words)
 

@@ -84,6 +84,13 @@ def test_a_stronger_detector_that_lies_there_is_noticed(tmp_path):
     assert detector_of(tmp_path / "sam-vit-base") == detector_of(tmp_path) == "transformers"
 
 
+def test_a_detector_of_free_text_is_measured_with_words(root_dir, tmp_path):
+    (tmp_path / "config.json").write_text('{"model_type": "grounding-dino"}')
+    command = ["models", "measure", str(tmp_path), str(root_dir / "bags" / "demo_room")]
+    refused = CliRunner().invoke(app, command)
+    assert refused.exit_code == 2 and "give --words 'mug, drill'" in refused.output
+
+
 def test_the_files_of_the_paper_differ_only_where_they_have_to(root_dir):
     def added(one, other):
         one, other = (to_mapping(load_config(root_dir / "config" / name)) for name in (one, other))

@@ -319,5 +319,7 @@ def save_closed_set(folder, family):
     edges = {"shortest_edge": 64, "longest_edge": 100}
     size = {"height": 64, "width": 64} if family == "rf_detr" else edges
     preprocessing = {"size": size, "do_normalize": True, **IMAGENET}
+    if family == "detr":  # as older versions of transformers saved it
+        preprocessing |= {"size": 64, "max_size": 100}
     (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
     return model

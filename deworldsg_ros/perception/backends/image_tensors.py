@@ -14,6 +14,8 @@ from deworldsg_ros.checkpoints.loading import CheckpointSource
 from deworldsg_ros.scene.arrays import UInt8
 from deworldsg_ros.scene.errors import ConfigurationError
 
+# Largest long side of DETR's input, where its file has none.
+DETR_LONGEST_PX = 1333
 # Side of a network's input: the largest published one has 1536.
 MAX_INPUT_PX = 4096
 
@@ -97,6 +99,8 @@ class Preprocessing:
 
 def _read(content: dict[str, Any], default: Preprocessing) -> Preprocessing:
     size = content.get("size", {})
+    if isinstance(size, int):  # of DETR, as older versions of transformers saved it
+        size = {"shortest_edge": size, "longest_edge": content.get("max_size", DETR_LONGEST_PX)}
     height = int(size.get("height", size.get("shortest_edge", default.height)))
     width = int(size.get("width", size.get("longest_edge", default.width)))
     edges = "shortest_edge" in size

@@ -269,6 +269,7 @@ class Sam3Concepts(TextNetwork):
             output = self.model(vision_embeds=image, text_embeds=text, attention_mask=used)
             rated = output.pred_logits[0].sigmoid() * output.presence_logits[0].sigmoid()
             require_finite(rated, "detector_error", "the scores")
+            require_finite(output.pred_boxes, "detector_error", "the boxes")
             rows = torch.nonzero(rated >= threshold)[:, 0]
             found = np.zeros((len(rows), len(prompt)))
             found[:, column] = rated[rows].double().cpu().numpy()
