@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from deworldsg_ros.base.files import write_atomically
+from deworldsg_ros.base.files import together, write_atomically
 from deworldsg_ros.checkpoints.cards import ONNX_CARD, OnnxCard
 from deworldsg_ros.checkpoints.catalogue import ONNX_FILE
 from deworldsg_ros.checkpoints.loading import noise_pattern
@@ -64,7 +63,8 @@ def export_detector(path: str, out: Path, images: Sequence[UInt8] = ()) -> Expor
     """
     try:
         import onnx
-        from transformers.exporters import OnnxConfig, OnnxExporter
+        import onnx_ir  # noqa: F401
+        import transformers.exporters  # noqa: F401
     except ImportError as error:
         raise ConfigurationError(
             f"the export needs onnx, onnxscript and transformers 5.23 ({error}): pip install "
@@ -77,36 +77,31 @@ def export_detector(path: str, out: Path, images: Sequence[UInt8] = ()) -> Expor
             "export has one: choose D-FINE, RT-DETR, RF-DETR, or run it on torch"
         )
     card = _card(detector)
-    noise = noise_pattern(card.height, card.width, 3).numpy()
-    pixels = detector.preprocess(noise, detector.device, detector.dtype)
-    with tempfile.TemporaryDirectory() as name, _quiet():
-        made = Path(name) / "float.onnx"
-        try:
-            exported = OnnxExporter().export(
-                detector.model, {INPUT: pixels}, config=OnnxConfig(dynamic=False)
-            )
-            _save(exported.program, made)
-        except Exception as error:  # torch and its exporter have errors of their own
-            reason = str(error).strip().splitlines()[0]
-            raise ConfigurationError(
-                f"detector '{path}' ({type(detector.model).__name__}) cannot be exported by "
-                f"transformers ({reason})"
-            ) from error
-        if images:
-            made = _with_8_bits(made, card, images)
-        onnx.checker.check_model(str(made))
-        content = made.read_bytes()
-    out.mkdir(parents=True, exist_ok=True)
-    write_atomically(out / ONNX_FILE, content)
-    write_atomically(out / ONNX_CARD, msgspec.json.format(msgspec.json.encode(card)) + b"\n")
-    difference = _difference(detector, out, [noise, *images[:8]])
-    if not images and not difference <= MAX_DIFFERENCE:
-        (out / ONNX_FILE).unlink()
-        raise ConfigurationError(
-            f"detector '{path}': a score of the export differs by {difference:.4f} from that of "
-            f"torch, expected at most {MAX_DIFFERENCE}: it was removed"
-        )
-    return Exported(len(content), difference, len(card.classes))
+    try:
+        with together(out, (ONNX_FILE, ONNX_CARD)) as staged:
+            network = staged / ONNX_FILE
+            with _quiet():
+                _write_network(detector, path, network)
+                if images:
+                    _make_8_bits(network, card, images)
+                onnx.checker.check_model(str(network))
+            content = msgspec.json.format(msgspec.json.encode(card), indent=2)
+            write_atomically(staged / ONNX_CARD, content + b"\n")
+            difference = _difference(detector, staged, [_noise(detector), *images[:8]])
+            if not images and not difference <= MAX_DIFFERENCE:
+                raise ConfigurationError(
+                    f"detector '{path}': a score of the export differs by {difference:.4f} from "
+                    f"that of torch, expected at most {MAX_DIFFERENCE}: nothing was written"
+                )
+            size = network.stat().st_size
+    except OSError as error:
+        raise ConfigurationError(f"{out}: {error.strerror or error}") from error
+    return Exported(size, difference, len(card.classes))
+
+
+def _noise(detector: ClosedSetDetector) -> UInt8:
+    noise: UInt8 = noise_pattern(detector.preprocess.height, detector.preprocess.width, 3).numpy()
+    return noise
 
 
 def _card(detector: ClosedSetDetector) -> OnnxCard:
@@ -125,19 +120,33 @@ def _card(detector: ClosedSetDetector) -> OnnxCard:
     )
 
 
-def _save(program: Any, path: Path) -> None:
-    """Write a network without the outputs that nobody reads."""
+def _write_network(detector: ClosedSetDetector, path: str, network: Path) -> None:
+    """Write a network in float32, without the outputs that nobody reads."""
     import onnx_ir
     from onnx_ir.passes.common import RemoveUnusedNodesPass
+    from transformers.exporters import OnnxConfig, OnnxExporter
 
-    kept = [value for value in program.graph.outputs if value.name in OUTPUTS]
-    program.graph.outputs.clear()
-    program.graph.outputs.extend(kept)
-    RemoveUnusedNodesPass()(program)
-    onnx_ir.save(program, str(path))
+    pixels = detector.preprocess(_noise(detector), detector.device, detector.dtype)
+    try:
+        program: Any = (
+            OnnxExporter()
+            .export(detector.model, {INPUT: pixels}, config=OnnxConfig(dynamic=False))
+            .program
+        )
+        kept = [value for value in program.graph.outputs if value.name in OUTPUTS]
+        program.graph.outputs.clear()
+        program.graph.outputs.extend(kept)
+        RemoveUnusedNodesPass()(program)
+        onnx_ir.save(program, str(network))
+    except Exception as error:  # torch and its exporter have errors of their own
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ConfigurationError(
+            f"detector '{path}' ({type(detector.model).__name__}) cannot be exported by "
+            f"transformers ({reason})"
+        ) from error
 
 
-def _with_8_bits(network: Path, card: OnnxCard, images: Sequence[UInt8]) -> Path:
+def _make_8_bits(network: Path, card: OnnxCard, images: Sequence[UInt8]) -> None:
     """As `tools/calibration/quantize_detector.py` makes the embedded weights, convolutions only."""
     from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
     from onnxruntime.quantization.shape_inference import quant_pre_process
@@ -163,7 +172,8 @@ def _with_8_bits(network: Path, card: OnnxCard, images: Sequence[UInt8]) -> Path
         activation_type=QuantType.QUInt8,
         weight_type=QuantType.QInt8,
     )
-    return made
+    prepared.unlink()
+    made.replace(network)
 
 
 def _difference(detector: ClosedSetDetector, out: Path, images: Sequence[UInt8]) -> float:
