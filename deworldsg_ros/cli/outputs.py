@@ -16,6 +16,7 @@ from rich.text import Text
 
 from deworldsg_ros.base.files import check_writable, together, write_atomically
 from deworldsg_ros.base.words import visible
+from deworldsg_ros.checkpoints.catalogue import unused_detector
 from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.doctor import Finding, FrameSampler, Observations, find
 from deworldsg_ros.graph.embeddings import embeddings_path
@@ -208,6 +209,7 @@ class RunObserver:
         from deworldsg_ros.perception.stage import Perception
 
         perception, builder = pipeline.perception, pipeline.builder
+        unused, settings = unused_detector(pipeline.config.perception)
         graph = None if builder is None else pipeline.graph()
         reasons: Counter[str] = Counter()
         for counts in drops.values():
@@ -224,6 +226,8 @@ class RunObserver:
             sizes=() if graph is None else sizes_of(graph),
             turns=self._turns,
             checks=self._sampler.checks(),
+            unused_detector=unused,
+            its_settings=settings,
         )
         return find(seen)
 

@@ -30,11 +30,24 @@ def _nanodet(config: PerceptionConfig) -> Detector:
     return NanoDetDetector(threads=config.threads)
 
 
-def _rtdetr(config: PerceptionConfig) -> Detector:
+def _transformers(config: PerceptionConfig) -> Detector:
     with _torch("perception.detector", config.detector, config):
-        from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
+        from deworldsg_ros.perception.backends.closed_set import ClosedSetDetector
 
-    return RtDetrDetector(config)
+    return ClosedSetDetector(config)
+
+
+def _open_vocabulary(config: PerceptionConfig) -> Detector:
+    with _torch("perception.detector", config.detector, config):
+        from deworldsg_ros.perception.backends.open_vocabulary import OpenVocabularyDetector
+
+    return OpenVocabularyDetector(config)
+
+
+def _onnx(config: PerceptionConfig) -> Detector:
+    from deworldsg_ros.perception.backends.onnx_detector import OnnxDetector
+
+    return OnnxDetector(config)
 
 
 def _topic(config: PerceptionConfig) -> Detector:
@@ -83,7 +96,7 @@ def _geometric(config: PerceptionConfig, detector: Detector) -> RelationHead:
 
 def _egtr(config: PerceptionConfig, detector: Detector) -> RelationHead:
     with _torch("perception.relation_head", config.relation_head, config):
-        from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead
+        from deworldsg_ros.perception.backends.closed_set import EgtrRelationHead
 
     return EgtrRelationHead(config, detector)
 
@@ -97,12 +110,16 @@ def _embedder(config: PerceptionConfig) -> Embedder:
 
 DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
     "nanodet": _nanodet,
-    "rtdetr": _rtdetr,
+    "transformers": _transformers,
+    # The same, by the name of the paper's detector.
+    "rtdetr": _transformers,
+    "open_vocabulary": _open_vocabulary,
+    "onnx": _onnx,
     "topic": _topic,
 }
 # Torch has one setting of its threads for the thread that sets it, and a GPU takes one frame after
 # the other anyway.
-THREAD_SAFE_DETECTORS = {"nanodet"}
+THREAD_SAFE_DETECTORS = {"nanodet", "onnx"}
 SEGMENTERS: dict[str, Callable[[PerceptionConfig], Segmenter]] = {
     "rgbd": _rgbd,
     "sam2": _sam2,

@@ -33,76 +33,20 @@ from deworldsg_ros.scene.arrays import (
     areas,
     shared_areas,
 )
-from deworldsg_ros.scene.camera import Intrinsics, MaskPatch, RgbdFrame, UpEstimator, quarter_turns
+from deworldsg_ros.scene.camera import (
+    Intrinsics,
+    MaskPatch,
+    RgbdFrame,
+    UpEstimator,
+    Uprighter,
+    UprightFrame,
+)
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import Embeddings, FrameGraph, Relations, Vocabulary
 from deworldsg_ros.scene.limits import check_names
 
-# --- Frames of a camera that is mounted on its side, turned upright for the detector.
-#
-# A quarter turn moves pixels and does not change them: the pixel (u, v) of an image of width W
-# becomes (v, W - 1 - u). Boxes and instances are turned back exactly.
-
-# R_camera_turned of one quarter turn: the new x axis is y, the new y axis is -x.
-QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-@dataclass(frozen=True)
-class UprightFrame:
-    """A frame, and the same frame turned upright.
-
-    Attributes:
-        original: as the camera took it.
-        upright: the same object if it needs no turn.
-        turns: quarter turns counter-clockwise from `original` to `upright`, 0 to 3.
-    """
-
-    original: RgbdFrame
-    upright: RgbdFrame
-    turns: int = 0
-
-
-class Uprighter:
-    """Decides for each frame, in order of time, how it is turned.
-
-    The turn changes only when up is clearly in the direction of another side of the image. A camera
-    that looks straight down keeps its turn.
-
-    Args:
-        world_up: as `UpEstimator`.
-    """
-
-    def __init__(self, world_up: str) -> None:
-        self._up = UpEstimator(world_up)
-        self._turns = 0
-
-    def turn(self, frame: RgbdFrame) -> UprightFrame:
-        """The frame, upright."""
-        self._up.observe(frame.T_world_camera)
-        turns = quarter_turns(frame.T_world_camera[:3, :3].T @ self._up.up_world())
-        self._turns = self._turns if turns is None else turns
-        return UprightFrame(frame, turned(frame, self._turns), self._turns)
-
-
-def turned(frame: RgbdFrame, turns: int) -> RgbdFrame:
-    """A frame after so many quarter turns counter-clockwise; its pose is that of the turned camera.
-
-    The same object for no turn.
-    """
-    if turns % 4 == 0:
-        return frame
-    intrinsics, T_world_camera = frame.intrinsics, frame.T_world_camera.copy()
-    for _ in range(turns % 4):
-        i = intrinsics
-        intrinsics = Intrinsics(i.fy, i.fx, i.cy, i.width - 1 - i.cx, i.height, i.width)
-        T_world_camera[:3, :3] = T_world_camera[:3, :3] @ QUARTER_TURN
-    return replace(
-        frame,
-        rgb=np.ascontiguousarray(np.rot90(frame.rgb, turns)),
-        depth_m=np.ascontiguousarray(np.rot90(frame.depth_m, turns)),
-        intrinsics=intrinsics,
-        T_world_camera=T_world_camera,
-    )
+# --- The results of a frame that was turned upright, for the image as the camera took it: boxes and
+# instances are turned back exactly.
 
 
 def turned_back(
@@ -453,6 +397,7 @@ class Perception:
         self._detector = detector
         self._segmenter = segmenter
         self._relation_head = relation_head
+        self._words = config.words
         self._refine = config.refine_detections
         self._up = UpEstimator(world_up)
         # Another process has seen the image as it is.
@@ -464,8 +409,31 @@ class Perception:
         self.vocabulary = _vocabulary(detector.classes, relation_head.predicates)
         self.configure(config)
 
+    def check(self, config: PerceptionConfig) -> None:
+        """Raise ConfigurationError for words that the detector cannot look for."""
+        if hasattr(self._detector, "check_words"):
+            self._detector.check_words(config.words)
+        elif config.words:
+            raise ConfigurationError(
+                f"perception.words needs a detector of free text, and perception.detector is "
+                f"'{config.detector}': set it to open_vocabulary, with a perception.detector_path"
+            )
+
+    def take_over(self, other: Perception, config: PerceptionConfig) -> None:
+        """Keep the columns of another perception's classes, which this one replaces."""
+        if hasattr(self._detector, "use_words"):
+            self._detector.use_words(config.words, other.vocabulary.classes)
+
     def configure(self, config: PerceptionConfig) -> None:
-        """Use another `score_threshold` and `max_relations` from the next frame on."""
+        """Use other `score_threshold`, `max_relations` and `words` from the next frame on.
+
+        Raises:
+            ConfigurationError: as `check`; nothing changes.
+        """
+        self.check(config)
+        if config.words != self._words:
+            self._detector.use_words(config.words)  # type: ignore[attr-defined]
+            self._words = config.words
         self._max_relations = config.max_relations
         self.score_threshold = (
             self._detector.default_score_threshold
@@ -598,9 +566,9 @@ class Perception:
     def segment(
         self, frame: RgbdFrame, objects: Detections, weak: Detections
     ) -> list[MaskPatch] | None:
-        """A mask of each object, without the pixels of `weak`; None if the segmenter failed.
+        """A mask of each object: the detector's, or the segmenter's without the pixels of `weak`.
 
-        Masks that the objects bring are taken as they are.
+        None if the segmenter failed.
         """
         if objects.masks is not None:
             return list(objects.masks)

@@ -19,8 +19,7 @@ from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.relations.clips import PublishedGraph
-from deworldsg_ros.relations.registry import build_world_model
-from deworldsg_ros.relations.stage import EvidenceWorker, RelationReasoner
+from deworldsg_ros.relations.stage import EvidenceWorker, RelationReasoner, build_world_model
 from deworldsg_ros.relations.world_model import require_predicates
 from deworldsg_ros.ros.inputs import (
     WANTED_DEPTH,
@@ -181,7 +180,11 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         options: arguments of rclpy's Node.
     """
 
-    LIVE: tuple[str, ...] = ("perception.score_threshold", "perception.max_relations")
+    LIVE: tuple[str, ...] = (
+        "perception.score_threshold",
+        "perception.max_relations",
+        "perception.words",
+    )
 
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, product, max_busy_s=MAX_BUSY_S, **options)
@@ -213,6 +216,10 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         listen_depth(self, self.taking(frames.add_depth), self.wants_depth, WANTED_DEPTH)
         listen_rgb(self, self.taking(frames.add_rgb), self.wants_images, WANTED_DEPTH)
 
+    def check(self, parameters: Any) -> None:
+        """Refuse words that the detector cannot look for."""
+        self._perception.check(parameters.perception)
+
     def configure(self) -> None:
         """Take changed parameters."""
         self._perception.configure(self.parameters.perception)
@@ -231,6 +238,7 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         config = msgspec.structs.replace(self.parameters.perception, device="cpu")
         self.get_logger().warning("loading the models again, on the CPU")
         fresh = build_perception(config, world_up=self.parameters.inputs.world_up)
+        fresh.take_over(self._perception, config)
         fresh.watch(lambda part, backend: self._models[part].replace(backend))
 
     def perceive(self, frame: RgbdFrame) -> Perceived:

@@ -56,6 +56,12 @@ def softmax(logits: Float64) -> Float64:
 # --- Axis-aligned boxes in an image: x1, y1, x2, y2.
 
 
+def corners_of(boxes_cxcywh: Float64) -> Float64:
+    """Corners (n, 4) of boxes (n, 4) given by centre, width and height."""
+    centres, halves = boxes_cxcywh[:, :2], boxes_cxcywh[:, 2:] / 2
+    return np.hstack([centres - halves, centres + halves])
+
+
 def areas(boxes: Float64) -> Float64:
     """Areas (n,) of boxes (n, 4); 0 for an inverted box."""
     return np.asarray(np.clip(boxes[:, 2:] - boxes[:, :2], 0.0, None).prod(axis=1))

@@ -29,7 +29,7 @@ from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 from deworldsg_ros.perception.stage import mean_colours
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.ros.health import REASONS
-from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
+from deworldsg_ros.scene.camera import Intrinsics, MaskPatch, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES
 
@@ -158,6 +158,21 @@ def with_embedder(embedder, boxes):
     return Perception(detector, RgbdSegmenter(), head, config, world_up="z", embedder=embedder)
 
 
+def test_the_masks_of_a_detector_are_used_as_they_are():
+    class MaskingDetector(ListedDetector):
+        def detect(self, rgb, score_threshold):
+            found = super().detect(rgb, score_threshold)
+            masks = (MaskPatch(0, 0, OWNER == 1), MaskPatch(0, 0, OWNER == 2))
+            return replace(found, masks=masks[: len(found)])
+
+    made = stage(MaskingDetector([TABLE, CUP], [0, 1], [0.6, 0.9]))
+    made._segmenter = None
+    found = made.perceive(FRAME)
+    assert found.frame_graph.scores.tolist() == [0.9, 0.6]
+    for label, value in ((1, 2), (2, 1)):
+        assert np.array_equal(found.instances == label, value == OWNER)
+
+
 VIEW = [0.03 * WIDTH, 0.03 * HEIGHT, 0.97 * WIDTH, 0.97 * HEIGHT]
 
 
@@ -256,7 +271,7 @@ def test_an_unknown_backend_is_refused(settings, offender):
     ("field", "name"), [("detector", "rtdetr"), ("segmenter", "sam2"), ("segmenter", "sam")]
 )
 def test_without_torch_the_error_names_the_package_to_install(field, name, monkeypatch):
-    for module in ("rtdetr", "sam"):
+    for module in ("closed_set", "sam"):
         monkeypatch.setitem(sys.modules, f"deworldsg_ros.perception.backends.{module}", None)
     with pytest.raises(ConfigurationError, match=f"'{name}'.*pip install torch"):
         build_perception(PerceptionConfig(**{field: name}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -50,9 +51,10 @@ class ImageEmbedder:
             vision.projection_dim = whole.projection_dim
         side = vision.image_size
         mean, std = NORMALISATIONS[kind]
-        self._preprocessing = Preprocessing.of_checkpoint(
-            source, Preprocessing(side, side, mean, std)
-        )
+        default = Preprocessing(side, side, mean, std)
+        found = Preprocessing.of_checkpoint(source, default)
+        # The crops are squares, and the network has one size.
+        self._preprocessing = replace(default, mean=found.mean, std=found.std)
         self._device = choose_device("perception.device", config.device)
         with one_tower():
             model = source.load(FAMILIES[kind], vision)
