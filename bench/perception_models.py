@@ -27,7 +27,7 @@ from deworldsg_ros.checkpoints.cards import (
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
 from deworldsg_ros.checkpoints.loading import HEAD_FILE
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector
+from deworldsg_ros.perception.backends.closed_set import ClosedSetDetector, EgtrRelationHead
 from deworldsg_ros.perception.backends.sam import Sam2Segmenter, SamSegmenter
 from deworldsg_ros.perception.protocols import SegmentedObjects
 from deworldsg_ros.scene.camera import Intrinsics
@@ -45,7 +45,7 @@ R18 = {"hidden_sizes": [64, 128, 256, 512], "depths": [2, 2, 2, 2], "layer_type"
 Frame = Callable[[], Any]
 
 
-def rtdetr(folder: Path, device: str, **changes: Any) -> RtDetrDetector:
+def rtdetr(folder: Path, device: str, **changes: Any) -> ClosedSetDetector:
     """A detector with the classes of Visual Genome and a relation head in one folder."""
     backbone = changes.pop("backbone", {})
     config = transformers.RTDetrConfig(
@@ -60,7 +60,7 @@ def rtdetr(folder: Path, device: str, **changes: Any) -> RtDetrDetector:
     write_detector_card(folder / DETECTOR_CARD, card)
     head = EgtrNetwork(config.d_model, config.decoder_layers, len(REPLICA_SSG_PREDICATES))
     save_file(head.state_dict(), folder / HEAD_FILE)
-    return RtDetrDetector(PerceptionConfig(detector_path=str(folder), device=device, threads=0))
+    return ClosedSetDetector(PerceptionConfig(detector_path=str(folder), device=device, threads=0))
 
 
 def detecting(**changes: Any) -> Callable[[Path, str], Frame]:

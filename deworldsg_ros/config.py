@@ -24,14 +24,28 @@ def option(description: str, **limits: Any) -> Any:
     return msgspec.Meta(description=description, **limits)
 
 
+def texts_limits(kind: Any) -> str:
+    """Limits of a list of texts, in words; of msgspec's description of its type."""
+    texts = kind.item_type
+    return f"at most {kind.max_length} of {texts.min_length} to {texts.max_length} characters"
+
+
+# Words of `perception.words`, and characters of one.
+MAX_WORDS, MAX_WORD_CHARACTERS = 200, 64
+Word = Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_WORD_CHARACTERS)]
+
+
 class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stage a: image → 2D scene graph and instance image."""
 
     detector: Annotated[
         str,
         option(
-            "detector: nanodet (shipped weights, COCO classes), rtdetr (RT-DETR, the paper's, "
-            "RT-DETRv2 or D-FINE), topic (another process sends them), or a plug-in"
+            "detector: nanodet (shipped weights, COCO classes), transformers (D-FINE, RF-DETR and "
+            "others of fixed classes; rtdetr, the paper's, is another name of it), open_vocabulary "
+            "(OWLv2, Grounding DINO, OmDet-Turbo or SAM 3 look for `words`), onnx (exported by "
+            "`deworldsg models export`, runs without torch), topic (another process sends them) or "
+            "a plug-in"
         ),
     ] = "nanodet"
     segmenter: Annotated[
@@ -72,10 +86,21 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = True
     detector_path: Annotated[
         str,
-        option("checkpoint of rtdetr and egtr: a folder, or a hub id in the local cache"),
+        option("checkpoint of the detector and egtr: a folder, or a hub id in the local cache"),
     ] = ""
+    words: Annotated[
+        tuple[Word, ...],
+        option("what the detector open_vocabulary looks for", max_length=MAX_WORDS),
+    ] = ()
     segmenter_path: Annotated[
         str, option("checkpoint of sam2, sam3 or sam: a folder, or a hub id in the local cache")
+    ] = ""
+    embedder: Annotated[
+        str,
+        option(
+            "CLIP, SigLIP or SigLIP 2 that embeds two objects a second, for questions by looks: a "
+            "folder, or a hub id in the local cache; empty = none"
+        ),
     ] = ""
     device: Annotated[
         Literal["auto", "cpu", "cuda"],

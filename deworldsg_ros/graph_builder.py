@@ -47,6 +47,7 @@ class GraphBuilder:
         frames: from which frames the nodes and edges come.
         space: the space that the camera has seen as free.
         prior: of class pairs.
+        refused: what was left out of the newest frame, in words, by reason.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class GraphBuilder:
         )
         self.frames, self.space = FrameMemory(), SeenSpace()
         self._newest_ns: int | None = None
+        self.refused: dict[str, str] = {}
 
     @property
     def prior(self) -> ClassPairPrior:
@@ -86,6 +88,11 @@ class GraphBuilder:
     def up(self) -> UpEstimator:
         """Estimates the direction against gravity from the poses of the frames."""
         return self._edges.up
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the newest frame."""
+        return self._newest_ns or int(self.graph.nodes.last_seen_ns.max(initial=0))
 
     @property
     def confirmed(self) -> int:
@@ -109,6 +116,7 @@ class GraphBuilder:
                 a second; also the reasons of `Merging.merge`. An older frame is of a clock that was
                 set back, and is merged.
         """
+        self.refused = {}
         last_ns = self._newest_ns
         if last_ns is not None and last_ns - RESTART_NS <= local.stamp_ns <= last_ns:
             raise RefusedInput(
@@ -121,6 +129,8 @@ class GraphBuilder:
         logits = local.relations.logits
         weights = softmax_weights(logits) if logits.size else None
         node_ids = self.merging.merge(self.graph, self._edges.weigh(local, weights))
+        self.graph.add_colours(local, node_ids)
+        self._add_embeddings(local, node_ids)
         votes = frame_votes(logits, weights)
         self._edges.observe(local, node_ids, votes)
         self.frames.note(self.graph, local, node_ids, votes)
@@ -128,6 +138,12 @@ class GraphBuilder:
         self._newest_ns = local.stamp_ns
         self._publication.note_frame(local.stamp_ns, node_ids)
         return node_ids
+
+    def _add_embeddings(self, local: LocalGraph, node_ids: list[int]) -> None:
+        try:
+            self.graph.add_embeddings(local, node_ids)
+        except RefusedInput as refusal:
+            self.refused[refusal.reason] = str(refusal)
 
     def edit(self, request: EditRequest) -> EditReply:
         """Make an operator's edit, or undo the newest one.
@@ -137,8 +153,7 @@ class GraphBuilder:
         Raises:
             RefusedInput: ``invalid_request``, with the reason; nothing is changed then.
         """
-        stamp_ns = self._newest_ns or int(self.graph.nodes.last_seen_ns.max(initial=0))
-        reply = self.merging.edit(self.graph, request, stamp_ns)
+        reply = self.merging.edit(self.graph, request, self.newest_ns)
         for node_id in reply.nodes:
             for old_id in self.graph.edits.origins(node_id):
                 self.frames.copy(old_id, node_id)

@@ -18,12 +18,11 @@ from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.perception.registry import build_perception
-from deworldsg_ros.perception.stage import Perceived, Perception, UprightFrame
+from deworldsg_ros.perception.stage import Perceived, Perception
 from deworldsg_ros.relations.clips import LiveGraph
-from deworldsg_ros.relations.registry import build_world_model
-from deworldsg_ros.relations.stage import RelationReasoner
+from deworldsg_ros.relations.stage import RelationReasoner, build_world_model
 from deworldsg_ros.relations.world_model import require_predicates
-from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.camera import RgbdFrame, UprightFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.wire import messages as wire
@@ -233,6 +232,7 @@ class Pipeline:
         assert self.builder is not None
         with timed(self.times_s["merging"]):
             node_ids = self.builder.integrate(local)
+        self.drops.update(self.builder.refused.keys())
         with timed(self.times_s["relations"]):
             self.builder.add_evidence(self.relations.observe(local, frame.rgb))
             for evidence in self.relations.drain():

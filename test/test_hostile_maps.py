@@ -42,6 +42,8 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     builder.graph.add_visual(1, 2, np.ones(3), 10**8)
     builder.graph.add_visual(3, 2, np.ones(3), 10**8)
     builder.graph.add_votes(1, 2, np.ones((2, 3)) / 3)
+    for node_id in (1, 2, 3):
+        builder.graph.embeddings.add(node_id, np.ones(3), np.eye(4, dtype=np.float16)[0], "clip")
     path = tmp_path_factory.mktemp("map") / "good.map"
     write_map(builder, path)
     assert len(read_map(CONFIG, path).graph) == 3
@@ -124,6 +126,11 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
     "duplicate ids": changed("ids", put(1, 1)),
     "next_id below an id": header(next_id=2),
     "existence of 7": changed("existence", put(0, 7.0)),
+    "a colour of NaN": changed("colours", lambda a: a * np.nan),
+    "a lightness of 500": changed("colours", lambda a: a + [500.0, 0.0, 0.0, 1.0]),
+    "embeddings of NaN": changed("embedding_vectors", lambda a: a * np.nan),
+    "viewpoints that are not there": changed("embedding_counts", lambda a: a + 1),
+    "an embedding of no node": changed("embedding_ids", put(0, 77)),
     "no observations": changed("observations", put(0, 0)),
     "a weight of 0": changed("weights", put(0, 0.0)),
     "first seen after last seen": changed("first_seen_ns", put(0, 10**18)),

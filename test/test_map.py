@@ -111,7 +111,9 @@ def version_1(arrays: dict[str, np.ndarray], votes: bool) -> dict[str, np.ndarra
     """
     header = {**msgspec.json.decode(arrays["header"].tobytes()), "version": 1, "revision": 99}
     edges, known = arrays["edge_counts"], arrays["vote_known"]
-    left_out = {"up"} if votes else {"up", "vote_pairs", "vote_known", "vote_counts", "existence"}
+    left_out = {"up", "colours"}
+    if not votes:
+        left_out |= {"vote_pairs", "vote_known", "vote_counts", "existence"}
     return {
         **{name: values for name, values in arrays.items() if name not in left_out},
         "header": np.frombuffer(msgspec.json.encode(header), np.uint8),

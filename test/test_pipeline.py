@@ -23,8 +23,7 @@ from deworldsg_ros.pipeline import (
     apply_ahead,
     read_ahead,
 )
-from deworldsg_ros.relations.registry import build_world_model
-from deworldsg_ros.relations.stage import RelationReasoner
+from deworldsg_ros.relations.stage import RelationReasoner, build_world_model
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary

@@ -24,6 +24,8 @@ CLASSES = ["cup", "table", "chair"]
 PREDICATES = ["on", "near", "under"]
 STAMP = wire.Stamp(sec=12, nanosec=300_000_000)
 EARLIER = wire.Stamp(sec=2, nanosec=100_000_000)
+# Real ones have 512 values and more.
+MODEL, VECTOR = "google/siglip2-base-patch16-224", struct.pack("<4e", 0.8, 0.0, -0.6, 0.0)
 SESSION = "5f3c0a91b7d2e846"
 
 
@@ -83,10 +85,17 @@ def _frame_examples() -> dict[str, wire.Message]:
             **image,
             **words,
             objects=[
-                wire.DetectedObject([310.0, 180.5, 352.0, 231.0], 0.91, [0.94, 0.03, 0.03]),
+                wire.DetectedObject(
+                    [310.0, 180.5, 352.0, 231.0],
+                    0.91,
+                    [0.94, 0.03, 0.03],
+                    [41.5, 52.0, 30.5],
+                    VECTOR,
+                ),
                 wire.DetectedObject([120.0, 215.0, 560.0, 402.5], 0.83, [0.02, 0.9, 0.08]),
             ],
             relations=relations,
+            embedding_model=MODEL,
         ),
         "local_graph": wire.LocalGraphMessage(
             **_head("local_graph"),
@@ -108,6 +117,7 @@ def _frame_examples() -> dict[str, wire.Message]:
             depth_grid=wire.DepthGridState(
                 640, 525.0, 525.0, 319.5, 239.5, b"\x3a\x07", b"\x02\x00"
             ),
+            embedding_model=MODEL,
         ),
         "relation_evidence": wire.RelationEvidenceMessage(
             **_head("relation_evidence"),
@@ -144,6 +154,14 @@ def _graph_examples() -> dict[str, wire.Message]:
             associations=[wire.Association(stamp=STAMP, nodes=[1, 2])],
             up=[0.0, 0.0, 1.0],
         ),
+        "embeddings": wire.EmbeddingsMessage(
+            **_head("embeddings"),
+            session=SESSION,
+            whole=False,
+            model=MODEL,
+            nodes=[wire.NodeEmbedding(id=1, vector=VECTOR)],
+            removed=[7],
+        ),
     }
 
 
@@ -167,6 +185,8 @@ def _lifted(
         depth_m=1.82,
         pixel_count=count,
         surface=struct.pack("<6f", mean[0] - 0.02, *mean[1:], mean[0] + 0.02, *mean[1:]),
+        colour_lab=[41.5, 52.0, 30.5],
+        embedding=VECTOR,
     )
 
 
@@ -190,6 +210,7 @@ def _node(
         remainder=0.03,
         box=wire.GravityBox(mean, [0.12, 0.1, 0.1], [0.0, 0.0, 0.0, 1.0]),
         surface_mm=b"\n\x00\x00\x00\xec\xff",
+        colour_lab=[41.5, 52.0, 30.5],
     )
 
 

@@ -66,6 +66,56 @@ def write_detector_card(path: Path, card: CheckpointCard) -> None:
     write_atomically(path, msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
 
 
+# --- The card of an exported detector, `model.json` beside `model.onnx`.
+
+ONNX_CARD = "model.json"
+Side = Annotated[int, msgspec.Meta(ge=1, le=4096)]
+Column = Annotated[int, msgspec.Meta(ge=0, lt=65536)]
+
+
+class OnnxCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Inputs and outputs of a detector that `deworldsg models export` wrote.
+
+    Attributes:
+        classes: names.
+        columns: output of each class.
+        height, width: of the input, pixels.
+        mean, std: per channel, RGB, of values in [0, 1].
+        class_scores: ``softmax`` or ``sigmoid``, as `CheckpointCard`.
+        no_object: whether the last output is "no object".
+        temperature: of the softmax of the class distribution.
+        score_threshold: least score of an object.
+        schema, version: of the file format.
+    """
+
+    classes: tuple[str, ...]
+    columns: tuple[Column, ...]
+    height: Side
+    width: Side
+    mean: tuple[float, float, float]
+    std: tuple[Positive, Positive, Positive]
+    class_scores: Literal["softmax", "sigmoid"]
+    no_object: bool
+    temperature: Positive
+    score_threshold: Annotated[float, msgspec.Meta(ge=0, le=1)]
+    schema: Literal["deworldsg/onnx_detector"] = "deworldsg/onnx_detector"
+    version: Literal[1] = 1
+
+
+def read_onnx_card(path: Path) -> OnnxCard:
+    """The card of an exported detector; raises ConfigurationError."""
+    try:
+        card = parse_json(read_regular(path, MAX_CARD_BYTES), OnnxCard)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"exported detector {path}: {error}") from error
+    if not card.classes or len(card.classes) != len(card.columns):
+        raise ConfigurationError(
+            f"exported detector {path}: {len(card.classes)} classes and {len(card.columns)} "
+            "columns; expected one column for each class"
+        )
+    return card
+
+
 def graph_predicates(config: PerceptionConfig) -> Union[tuple[str, ...], None]:
     """The predicates of the graph, for nodes that do not run perception.
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from deworldsg_ros.base.files import read_regular
 from deworldsg_ros.config import PerceptionConfig, RelationsConfig
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -22,8 +24,11 @@ class Published:
         name: of the folder, and for `deworldsg models get`.
         repository: id on the hub.
         purpose: options that use it.
-            licence: as its hub page states; `models get` shows the one of the download.
+        licence: as its hub page states; `models get` shows the one of the download.
         note: classes and accuracy, as its authors publish them; empty = none.
+        parameters_m: millions of parameters, as published; 0 = not known here.
+        revision: commit that is fetched; empty = the newest.
+        sha256: of model.safetensors; empty = not known. Another content is refused.
     """
 
     name: str
@@ -31,41 +36,91 @@ class Published:
     purpose: str
     licence: str
     note: str = ""
+    parameters_m: float = 0
+    revision: str = ""
+    sha256: str = ""
+
+    def described(self) -> str:
+        """Note, size and licence, in words."""
+        size = f"{self.parameters_m:g} million parameters" if self.parameters_m else ""
+        pinned = f"commit {self.revision[:12]}" if self.revision else ""
+        return "; ".join(filter(None, (self.note, size, f"licence {self.licence}", pinned)))
 
 
 def _published(owner: str, purpose: str, licence: str, *names: str) -> list[Published]:
     return [Published(name, f"{owner}/{name}", purpose, licence) for name in names]
 
 
-def _dfine(size: str, ap: float) -> list[Published]:
-    """D-FINE of a size, for the 80 classes of COCO and the 365 of Objects365."""
-    found = [
-        Published(f"dfine-{size}-coco", f"ustc-community/dfine-{size}-coco", DETECTOR, "apache-2.0",
-                  f"80 classes, AP {ap} on COCO"),
-        Published(f"dfine-{size}-obj365", f"ustc-community/dfine-{size}-obj365", DETECTOR,
-                  "apache-2.0", "365 classes"),
-    ]  # fmt: skip
-    return found[: 1 if size == "nano" else 2]
+def _detector(
+    repository: str, note: str, parameters_m: float, purpose: str = "", **pins: str
+) -> Published:
+    name, licence = repository.partition("/")[2], "apache-2.0"
+    return Published(name, repository, purpose or DETECTOR, licence, note, parameters_m, **pins)
 
 
-DETECTOR, SEGMENTER = "perception.detector: rtdetr", "perception.segmenter"
+def _dfine(size: str, parameters_m: float, coco: float, after_objects365: float) -> list[Published]:
+    """D-FINE of a size: for COCO, for Objects365, and for COCO after Objects365."""
+    of = f"ustc-community/dfine-{size}"
+    last = f"{of}-obj2coco{'-e25' if size == 'large' else ''}"
+    return [
+        _detector(f"{of}-coco", f"80 classes, AP {coco} on COCO", parameters_m),
+        _detector(f"{of}-obj365", "365 classes", parameters_m),
+        _detector(last, f"80 classes, AP {after_objects365} on COCO", parameters_m),
+    ]
+
+
+DETECTOR, SEGMENTER = "perception.detector: transformers", "perception.segmenter"
+TEXT_DETECTOR = "perception.detector: open_vocabulary"
 WORLD_MODEL = "relations.world_model"
+# Accuracy and parameters are those of the README of D-FINE, RT-DETR and RF-DETR, and of the paper
+# of Grounding DINO. Pins are those on which public code of several others agrees: nothing was
+# fetched for this list.
 CATALOGUE = {
     model.name: model
     for model in (
-        *_published("PekingU", DETECTOR, "apache-2.0", "rtdetr_r18vd", "rtdetr_r50vd"),
-        *_published("PekingU", DETECTOR, "apache-2.0", "rtdetr_v2_r50vd"),
-        *_dfine("nano", 42.8),
-        *_dfine("small", 48.5),
-        *_dfine("medium", 52.3),
-        *_dfine("large", 54.0),
-        *_dfine("xlarge", 55.8),
+        _detector(
+            "ustc-community/dfine-nano-coco",
+            "80 classes, AP 42.8 on COCO",
+            4,
+            revision="066438d3d8f0da137a37b38fdf3368fd4afceced",
+            sha256="19e06bdc873da819920a8d373b879721a5b9759d822f8213220bb09abbdab58b",
+        ),
+        *_dfine("small", 10, 48.5, 50.7),
+        *_dfine("medium", 19, 52.3, 55.1),
+        *_dfine("large", 31, 54.0, 57.3),
+        *_dfine("xlarge", 62, 55.8, 59.3),
+        _detector("PekingU/rtdetr_r18vd", "80 classes, AP 46.5 on COCO", 20),
+        _detector("PekingU/rtdetr_r50vd", "80 classes, AP 53.1 on COCO", 42),
+        _detector("PekingU/rtdetr_v2_r50vd", "80 classes, AP 53.4 on COCO", 42),
+        _detector("Roboflow/rf-detr-nano", "80 classes, AP 48.4 on COCO", 30.5),
+        _detector("Roboflow/rf-detr-small", "80 classes, AP 53.0 on COCO", 32.1),
+        _detector("Roboflow/rf-detr-medium", "80 classes, AP 54.7 on COCO", 33.7),
+        _detector("Roboflow/rf-detr-large", "80 classes, AP 56.5 on COCO", 33.9),
+        _detector(
+            "IDEA-Research/grounding-dino-tiny",
+            "free text, AP 48.4 on COCO without its training",
+            172,
+            TEXT_DETECTOR,
+            revision="a2bb814dd30d776dcf7e30523b00659f4f141c71",
+            sha256="1a2412ef99bd74bcd3c2a246fa1e48581f8889a1300c9051974741314fc042f3",
+        ),
+        _detector(
+            "google/owlv2-base-patch16-ensemble",
+            "free text",
+            155,
+            TEXT_DETECTOR,
+            revision="cfd3195ba4ea9592eec887ded089f4c08eff231d",
+        ),
+        _detector("omlab/omdet-turbo-swin-tiny-hf", "free text; needs timm", 0, TEXT_DETECTOR),
         *_published(
             *("facebook", f"{SEGMENTER}: sam2", "apache-2.0"),
             *(f"sam2.1-hiera-{size}" for size in ("tiny", "small", "base-plus", "large")),
         ),
         *_published("facebook", f"{SEGMENTER}: sam", "apache-2.0", "sam-vit-base", "sam-vit-large"),
-        *_published("facebook", f"{SEGMENTER}: sam3", "SAM licence; accept it there", "sam3"),
+        *_published(
+            *("facebook", f"{SEGMENTER}: sam3, or {TEXT_DETECTOR}"),
+            *("SAM licence; accept it there", "sam3"),
+        ),
         *_published(
             *("facebook", f"{WORLD_MODEL}: vjepa2", "mit"),
             *("vjepa2-vitl-fpc64-256", "vjepa2-vitg-fpc64-256", "vjepa2-vitg-fpc64-384"),
@@ -74,6 +129,7 @@ CATALOGUE = {
             *("facebook", f"{WORLD_MODEL}: dinov2", "apache-2.0"),
             *("dinov2-small", "dinov2-base", "dinov2-large"),
         ),
+        *_published("google", "perception.embedder", "apache-2.0", "siglip2-base-patch16-224"),
     )
 }
 # Names that stand for several models. The embedded models are part of the package.
@@ -82,6 +138,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "embedded": (),
     # Names 365 things of households, and runs on a CPU.
     "detector": ("dfine-small-obj365",),
+    # Apache licence, no further package, and a published accuracy.
+    "open-vocabulary": ("grounding-dino-tiny",),
 }
 # What the paper needs and the hub does not have: folder, content, how to get it.
 NOT_ON_THE_HUB = (
@@ -108,8 +166,17 @@ def is_complete(folder: Path) -> bool:
 
 # --- The checkpoints that a configuration needs, and how to get the missing ones. Needs no torch.
 
+# An exported detector, in a folder with a description.
+ONNX_FILE = "model.onnx"
+# A config.json of Objects365 has 30 kB.
+MAX_CONFIG_BYTES = 4_000_000
 # How to get the checkpoint of a backend: title, name for `deworldsg models get`.
-DETECTORS = {"rtdetr": ("RT-DETR", "rtdetr_r50vd")}
+DETECTORS = {
+    "transformers": ("detector", "dfine-small-obj365"),
+    "rtdetr": ("RT-DETR", "rtdetr_r50vd"),
+    "open_vocabulary": ("detector of free text", "grounding-dino-tiny"),
+    "onnx": ("exported detector", "dfine-small-obj365"),
+}
 SEGMENTERS = {
     "sam2": ("SAM 2", "sam2.1-hiera-tiny"),
     "sam3": ("SAM 3", "sam3"),
@@ -119,6 +186,45 @@ WORLD_MODELS = {
     "vjepa2": ("V-JEPA 2", "vjepa2-vitg-fpc64-384"),
     "dinov2": ("DINOv2", "dinov2-small"),
 }
+
+
+# Model types of checkpoints that find what words name.
+TEXT_TYPES = ("owlv2", "grounding-dino", "mm-grounding-dino", "omdet-turbo", "sam3", "sam3_video")
+
+
+def detector_of(folder: Path) -> str:
+    """The name of the backend that runs the detector of a folder.
+
+    A folder without a readable configuration, or an id of the hub, counts as a transformers one:
+    its loader tells the fault.
+    """
+    if (folder / ONNX_FILE).is_file():
+        return "onnx"
+    try:
+        content = json.loads(read_regular(folder / "config.json", MAX_CONFIG_BYTES))
+        is_text = content["model_type"] in TEXT_TYPES
+    except (OSError, ValueError, KeyError, TypeError):
+        is_text = False
+    return "open_vocabulary" if is_text else "transformers"
+
+
+def unused_detector(config: PerceptionConfig, into: Path = MODELS_FOLDER) -> tuple[str, str]:
+    """Folder of a stronger detector and the options that use it; empty if there is none.
+
+    Args:
+        config: of a run; a detector is unused if this names the embedded one.
+        into: folder of the models.
+    """
+    if config.detector != PerceptionConfig().detector or not into.is_dir():
+        return "", ""
+    for folder in sorted(into.iterdir()):
+        backend = detector_of(folder)
+        known = folder.name in CATALOGUE and CATALOGUE[folder.name].purpose == DETECTOR
+        if backend == "onnx" or (known and is_complete(folder)):
+            return str(folder), (
+                f"--set perception.detector={backend} --set perception.detector_path={folder}"
+            )
+    return "", ""
 
 
 def is_hub_id(name: str) -> bool:
@@ -155,7 +261,9 @@ def missing_perception(config: PerceptionConfig) -> list[str]:
     lines = []
     if config.detector in DETECTORS and _is_missing(config.detector_path):
         title, name = DETECTORS[config.detector]
-        if config.relation_head == "egtr":
+        if config.detector == "onnx":
+            advice = "run `deworldsg models export NAME {folder}`"
+        elif config.relation_head == "egtr":
             (_, title, advice), _ = NOT_ON_THE_HUB
         else:
             advice = _get(config.detector_path, name)
@@ -164,6 +272,9 @@ def missing_perception(config: PerceptionConfig) -> list[str]:
         title, name = SEGMENTERS[config.segmenter]
         advice = _get(config.segmenter_path, name)
         lines.append(_line(title, "perception.segmenter_path", config.segmenter_path, advice))
+    if config.embedder and _is_missing(config.embedder):
+        advice = _get(config.embedder, "siglip2-base-patch16-224")
+        lines.append(_line("SigLIP or CLIP", "perception.embedder", config.embedder, advice))
     return lines
 
 

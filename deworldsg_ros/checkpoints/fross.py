@@ -13,7 +13,12 @@ import msgspec
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import save
-from transformers import RTDetrConfig, RTDetrResNetConfig, RTDetrV2Config
+from transformers import (
+    AutoModelForObjectDetection,
+    RTDetrConfig,
+    RTDetrResNetConfig,
+    RTDetrV2Config,
+)
 
 from deworldsg_ros.base.files import together, write_atomically
 from deworldsg_ros.checkpoints.cards import (
@@ -24,7 +29,7 @@ from deworldsg_ros.checkpoints.cards import (
     write_detector_card,
 )
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
-from deworldsg_ros.checkpoints.loading import DETECTORS, HEAD_FILE, check_names, read_tensors
+from deworldsg_ros.checkpoints.loading import HEAD_FILE, check_names, read_tensors
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabulary import (
     REPLICA_SSG_PREDICATES,
@@ -271,7 +276,7 @@ def import_checkpoint(
     detector, head = split(read_tensors(path, "state_dict"), str(path))
     settings = _settings_beside(path)
     config = infer_config(detector, settings, str(path))
-    model = DETECTORS[config.model_type](config)
+    model = AutoModelForObjectDetection.from_config(config)
     _fill(model, detector, str(path))
     network = EgtrNetwork.for_parameters(head, f"{path} ({HEAD_PREFIX}…)")
     if network.final_sub_proj.in_features != config.d_model:

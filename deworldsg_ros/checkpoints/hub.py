@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import msgspec
 
 from deworldsg_ros.base.files import confined, parse_json, write_atomically
+from deworldsg_ros.checkpoints.cards import WEIGHTS_FILE
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # --- Names, dtypes and shapes of a checkpoint's parameters, without its weights.
@@ -119,13 +120,16 @@ def _entries(content: Any) -> Iterator[tuple[str, Any]]:
 
 # --- Download of a model from the Hugging Face hub: only what is used, resumed and verified.
 
-# Configuration, weights in safetensors (no pickles), preprocessing, licence.
+# Configuration, weights in safetensors (no pickles), preprocessing, tokenizer, licence.
 USED_FILES = (
     "config.json",
     "model*.safetensors",
     "model.safetensors.index.json",
     "pre*processor_config.json",
     "processor_config.json",
+    # Of texts.
+    *("tokenizer*.json", "special_tokens_map.json", "added_tokens.json"),
+    *("vocab.json", "vocab.txt", "merges.txt"),
     "LICENSE*",
     "README.md",
 )
@@ -174,10 +178,15 @@ class Hub:
             ) from error
         self._api: Any = HfApi(endpoint=os.environ.get("HF_ENDPOINT") or None)
 
-    def find(self, repository: str) -> RemoteModel:
-        """Commit, licence and files of a model; raises ConfigurationError."""
+    def find(self, repository: str, revision: str = "") -> RemoteModel:
+        """Commit, licence and files of a model; raises ConfigurationError.
+
+        Args:
+            repository: id on the hub.
+            revision: commit; empty = the newest.
+        """
         try:
-            info = self._api.model_info(repository, files_metadata=True)
+            info = self._api.model_info(repository, revision=revision or None, files_metadata=True)
         except Exception as error:  # the hub's client has many errors, and those of its transport
             raise ConfigurationError(_advice(repository, error)) from error
         card = info.card_data or {}
@@ -199,7 +208,11 @@ class Hub:
         return RemoteModel(repository, str(info.sha), str(licence), files)
 
     def fetch(
-        self, model: RemoteModel, folder: Path, report: Callable[[str], None] = lambda line: None
+        self,
+        model: RemoteModel,
+        folder: Path,
+        report: Callable[[str], None] = lambda line: None,
+        sha256_of_weights: str = "",
     ) -> None:
         """Download the files into a folder, verify them, and write SHA256SUMS.
 
@@ -209,10 +222,19 @@ class Hub:
             model: result of `find`.
             folder: created if missing.
             report: gets a line for each file.
+            sha256_of_weights: of model.safetensors; empty = any that the hub names.
 
         Raises:
             ConfigurationError: no access, no network, or a file with another checksum.
         """
+        for file in model.files if sha256_of_weights else ():
+            pinned = f"sha256:{sha256_of_weights}"
+            if file.name == WEIGHTS_FILE and file.checksum != pinned:
+                raise ConfigurationError(
+                    f"{model.repository}, commit {model.commit}: {file.name} has {file.checksum} "
+                    f"on the hub, and the catalogue expects {pinned}: nothing was fetched. If its "
+                    f"authors changed it and you trust them, name it as {model.repository}"
+                )
         sums = []
         for file in model.files:
             path = confined(folder, file.name)

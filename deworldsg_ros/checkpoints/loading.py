@@ -13,22 +13,19 @@ from typing import Any
 
 import torch
 import transformers
-from transformers import (
-    DFineForObjectDetection,
-    RTDetrForObjectDetection,
-    RTDetrV2ForObjectDetection,
-)
 
 from deworldsg_ros.checkpoints.catalogue import is_hub_id
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 
-# --- Detector classes of `transformers`, and the file name of the relation head.
+# --- Detectors of `transformers`, and the file name of the relation head.
 
-# Detectors, by the model type in config.json.
-DETECTORS: dict[str, Any] = {
-    "rt_detr": RTDetrForObjectDetection,
-    "rt_detr_v2": RTDetrV2ForObjectDetection,
-    "d_fine": DFineForObjectDetection,
+# Detectors of `AutoModelForObjectDetection` that transformers reads alike, by the model type in
+# config.json: a sigmoid for each class, or a softmax with "no object" as the last class. The others
+# find text and layouts of documents.
+DETECTORS = {
+    **dict.fromkeys(("rt_detr", "rt_detr_v2", "d_fine", "deimv2", "rf_detr", "lw_detr"), "sigmoid"),
+    **dict.fromkeys(("conditional_detr", "dab-detr", "deformable_detr"), "sigmoid"),
+    **dict.fromkeys(("detr", "table-transformer", "yolos"), "softmax"),
 }
 # File of the relation head, beside the detector's weights.
 HEAD_FILE = "egtr_head.safetensors"
@@ -163,6 +160,18 @@ class CheckpointSource:
                 "choose one of the complete network"
             )
         return model.eval().requires_grad_(False)
+
+    def tokenizer(self) -> Any:
+        """The tokenizer of a checkpoint that reads text; raises ConfigurationError."""
+        try:
+            return transformers.AutoTokenizer.from_pretrained(
+                self.name, local_files_only=self.local_files_only
+            )
+        except Exception as error:  # transformers raises errors of many types
+            raise ConfigurationError(
+                f"{self.parameter} '{self.name}' has no tokenizer ({first_line(error)}), expected "
+                "tokenizer.json or its parts: download the checkpoint again"
+            ) from error
 
     def _cannot_load(self, error: Exception) -> str:
         reason = f"{self.parameter} '{self.name}' cannot be loaded ({first_line(error)})"

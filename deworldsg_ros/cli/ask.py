@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 import re
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import msgspec
 import numpy as np
@@ -33,7 +34,13 @@ from deworldsg_ros.scene.camera import rigid_motion
 from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.wire import messages as wire
 
+if TYPE_CHECKING:
+    from deworldsg_ros.client import SceneGraphClient
+
 # --- `deworldsg query`, `goal` and `explain`: ask a scene graph.
+
+# graph_node looks once a second whether somebody wants embeddings.
+LOOKS_S = 5.0
 
 # typer evaluates these annotations at run time.
 Words = Annotated[
@@ -157,12 +164,21 @@ def _opened(words: list[str], live: bool, namespace: str) -> Iterator[tuple[Scen
     if live:
         from deworldsg_ros.client import SceneGraphClient
 
-        with SceneGraphClient(namespace) as client:
-            yield client.graph, words
+        by_looks = words[0].lower().split()[:1] == ["like"]
+        with SceneGraphClient(namespace, embeddings=by_looks) as client:
+            yield _with_looks(client) if by_looks else client.graph, words
         return
     if len(words) < 2:
         raise ClientError(f"'{' '.join(words)}': expected a graph and a question, or --live")
     yield SceneGraph.load(Path(words[0])), words[1:]
+
+
+def _with_looks(client: SceneGraphClient) -> SceneGraph:
+    """The newest graph, with its embeddings if they come in time."""
+    end_s = time.monotonic() + LOOKS_S
+    while client.graph.looks is None and time.monotonic() < end_s:
+        time.sleep(0.05)
+    return client.graph
 
 
 def _which(words: list[str]) -> int | str:
@@ -300,7 +316,7 @@ def mcp(
         return
     from deworldsg_ros.client import SceneGraphClient
 
-    with SceneGraphClient(namespace) as client:
+    with SceneGraphClient(namespace, embeddings=True) as client:
         make_server(lambda: client.graph, client, edits).run()
 
 

@@ -12,7 +12,7 @@ import typer
 
 from deworldsg_ros.base.files import parse_yaml
 from deworldsg_ros.base.words import suggestion
-from deworldsg_ros.config import Config, from_mapping, load_config, to_mapping
+from deworldsg_ros.config import Config, from_mapping, load_config, texts_limits, to_mapping
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # --- Arguments and options that several commands of `deworldsg` share.
@@ -216,8 +216,10 @@ def described_yaml(config: Config) -> str:
         if f"    {section}:" not in lines:
             kind = type(getattr(config, section))
             lines += ["", f"    # {(kind.__doc__ or '').strip()}", f"    {section}:"]
-        value = msgspec.yaml.encode(mapping[section][field]).decode()
-        # msgspec ends a document that is one plain value with a line of three dots.
+        value = mapping[section][field]
+        # A list in one line: JSON is YAML. msgspec ends a plain value with a line of three dots.
+        listed = isinstance(value, (list, tuple))
+        value = (msgspec.json if listed else msgspec.yaml).encode(value).decode()
         lines += [*_comment(description), f"      {field}: {value.splitlines()[0]}"]
     return "\n".join(lines) + "\n"
 
@@ -244,6 +246,8 @@ def _description(metadata: Any) -> str:
     kind = metadata.type
     if isinstance(kind, msgspec.inspect.LiteralType):
         return f"{text} [{' | '.join(map(str, kind.values))}]"
+    if isinstance(kind, msgspec.inspect.VarTupleType):
+        return f"{text} [{texts_limits(kind)}]"
     limits = [
         f"{sign} {getattr(kind, name):g}"
         for name, sign in (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))

@@ -28,7 +28,7 @@ from rich.console import Console
 from deworldsg_ros import __version__
 from deworldsg_ros.base.kernels import COMPILING
 from deworldsg_ros.base.words import counted
-from deworldsg_ros.checkpoints.catalogue import require_checkpoints
+from deworldsg_ros.checkpoints.catalogue import require_checkpoints, unused_detector
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.outputs import as_report, print_findings, sizes_of
@@ -487,7 +487,7 @@ def run_demo(
             poses = [np.array(values).reshape(4, 4) for values in finished.poses]
             frames = _frames(recording.path, config, options)
             outputs.show_graph(staged, graph, console, poses, config.inputs.world_up, frames)
-            findings = _findings(graph, finished)
+            findings = _findings(graph, finished, config)
             _write_report(staged, recording, graph, finished, wall_s, findings)
         _print_summary(out, finished, console)
         print_findings(console, findings)
@@ -633,8 +633,11 @@ def _write_report(
     outputs.write_report(out, report)
 
 
-def _findings(graph: wire.SceneGraphMessage, finished: replaying.Finished) -> list[Finding]:
-    """Findings, from the diagnostics of the nodes and the graph."""
+def _findings(
+    graph: wire.SceneGraphMessage, finished: replaying.Finished, config: Config
+) -> list[Finding]:
+    """Findings, from the diagnostics of the nodes, the graph and the configuration."""
+    unused, settings = unused_detector(config.perception)
     seen = replace(
         observations_of(finished.diagnostics),
         images=finished.published,
@@ -643,6 +646,8 @@ def _findings(graph: wire.SceneGraphMessage, finished: replaying.Finished) -> li
         hidden=Counter(node.reason for node in graph.hidden or ()),
         sizes=sizes_of(graph),
         missing=(),  # after the last frame, every input is missing
+        unused_detector=unused,
+        its_settings=settings,
     )
     return find(seen)
 

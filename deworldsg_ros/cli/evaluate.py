@@ -24,8 +24,13 @@ from deworldsg_ros.cli.evaluate_options import (
 from deworldsg_ros.cli.terminal import find_shared, frame_progress
 from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.evaluation import tables
-from deworldsg_ros.evaluation.front_ends import FrontEndChoice, parse_faults
-from deworldsg_ros.evaluation.pose_sources import KINDS, PERTURBATION, PoseSource
+from deworldsg_ros.evaluation.front_ends import (
+    PERTURBATION,
+    POSE_KINDS,
+    FrontEndChoice,
+    PoseSource,
+    parse_faults,
+)
 from deworldsg_ros.evaluation.recorded_room import open_annotations
 from deworldsg_ros.evaluation.reports import (
     Evaluation,
@@ -38,7 +43,11 @@ from deworldsg_ros.evaluation.reports import (
     write_folder,
     write_json,
 )
-from deworldsg_ros.evaluation.rows import Configurations, Row, table_rows
+from deworldsg_ros.evaluation.rows import (
+    Configurations,
+    Row,
+    table_rows,
+)
 from deworldsg_ros.evaluation.runner import ScanOutcome, ScanTask, evaluate_scan
 from deworldsg_ros.evaluation.scoring import ProtocolOptions
 from deworldsg_ros.evaluation.tables import Job, JobResult, jobs_of, run_jobs
@@ -275,7 +284,7 @@ def make_table(
     console = Console(markup=False)
     files = _named_files(kind, comparing.predictions or [])
     annotations = open_annotations(data.dataset, data.layout)
-    poses = pose_sources(running, KINDS if kind == "pose" else ())
+    poses = pose_sources(running, POSE_KINDS if kind == "pose" else ())
     if len(poses) > 1 and kind != "pose":
         raise EvaluationError(
             f"evaluate table {kind} takes one --poses, found {len(poses)}; the pose table takes "

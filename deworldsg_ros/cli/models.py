@@ -25,7 +25,9 @@ from deworldsg_ros.checkpoints.catalogue import (
     GROUPS,
     MODELS_FOLDER,
     NOT_ON_THE_HUB,
+    TEXT_DETECTOR,
     Published,
+    detector_of,
     is_complete,
     is_hub_id,
 )
@@ -33,6 +35,7 @@ from deworldsg_ros.checkpoints.hub import SUMS_FILE, Hub, ParameterHeader, read_
 from deworldsg_ros.cli.configuration import EXIT_USAGE
 from deworldsg_ros.client.meanings import is_class
 from deworldsg_ros.config import Config, PerceptionConfig
+from deworldsg_ros.scene.arrays import UInt8
 from deworldsg_ros.scene.errors import (
     ConfigurationError,
     DeWorldSGError,
@@ -59,17 +62,22 @@ def get_models(names: list[str], into: Path, console: Console) -> None:
     if chosen:
         hub = Hub()
         for published in chosen:
-            model, folder = hub.find(published.repository), into / published.name
+            model = hub.find(published.repository, published.revision)
+            folder = into / published.name
             console.print(
                 f"{model.repository}, commit {model.commit[:12]}, licence {model.licence}, "
                 f"{model.size / 1e9:.2f} GB → {folder}"
             )
+            if published.name in CATALOGUE:
+                console.print(f"  {published.described()}")
             _make_folder(folder)
-            hub.fetch(model, folder, lambda line: console.print(f"  {line}"))
-            if published.purpose == DETECTOR:
+            hub.fetch(model, folder, lambda line: console.print(f"  {line}"), published.sha256)
+            if published.purpose in (DETECTOR, TEXT_DETECTOR):
+                words = " --set 'perception.words=[mug, red mug, drill]'"
                 console.print(
-                    "use it: --set perception.detector=rtdetr --set "
+                    f"use it: --set {published.purpose.replace(': ', '=')} --set "
                     f"perception.detector_path={folder}"
+                    f"{words if published.purpose == TEXT_DETECTOR else ''}"
                 )
     if "paper" in names:
         for name, title, advice in NOT_ON_THE_HUB:
@@ -84,8 +92,7 @@ def list_models(folder: Path, console: Console) -> None:
     for name, model in CATALOGUE.items():
         state = _state(folder / name)
         mark = ", of config/paper.yaml" if name in paper else ""
-        note = f"; {model.note}" if model.note else ""
-        console.print(f"{state:10} {name}: {model.purpose}{mark}{note}; licence {model.licence}")
+        console.print(f"{state:10} {name}: {model.purpose}{mark}; {model.described()}")
     for name, title, advice in NOT_ON_THE_HUB:
         state = _state(folder / name)
         how = "" if state == "there" else f"; {advice.format(folder=folder / name)}"
@@ -141,13 +148,16 @@ class Measured:
     precision: float | None = None
 
 
-def measure_detectors(names: list[str], recording: Path, into: Path, console: Console) -> None:
+def measure_detectors(
+    names: list[str], recording: Path, into: Path, words: tuple[str, ...], console: Console
+) -> None:
     """Print what the embedded detector and others make of a recording.
 
     Args:
         names: models of the catalogue, folders of checkpoints, or plug-ins.
         recording: its ground truth is used if it is there (bags/README.md).
         into: folder of the models.
+        words: what detectors of free text look for.
         console: terminal.
 
     Raises:
@@ -158,7 +168,7 @@ def measure_detectors(names: list[str], recording: Path, into: Path, console: Co
         table.add_column(column, justify="left" if column == "detector" else "right")
     for name in dict.fromkeys(["embedded", *names]):
         with console.status(f"{name} …"):
-            done = _measure(name, recording, into)
+            done = _measure(name, recording, into, words)
         table.add_row(
             name,
             f"{done.frames_per_s:.1f}",
@@ -170,14 +180,14 @@ def measure_detectors(names: list[str], recording: Path, into: Path, console: Co
     console.print(table)
 
 
-def _measure(name: str, recording: Path, into: Path) -> Measured:
+def _measure(name: str, recording: Path, into: Path, words: tuple[str, ...]) -> Measured:
     # The pipeline and the evaluation are slow to import; no other command here needs them.
     from deworldsg_ros.evaluation.graph_measures import measure, read_reference
     from deworldsg_ros.evaluation.recorded_room import RecordedRoom, has_ground_truth
     from deworldsg_ros.pipeline import Pipeline
     from deworldsg_ros.recordings.recording import Recording, open_source
 
-    pipeline = Pipeline(Config(perception=_perception_of(name, into)))
+    pipeline = Pipeline(Config(perception=_perception_of(name, into, words)))
     frames, detections, seconds = 0, 0, 0.0
     with closing(open_source(recording)) as source:
         for frame in Recording(source).frames():
@@ -200,7 +210,62 @@ def _measure(name: str, recording: Path, into: Path) -> Measured:
     return replace(done, found=(found.found, found.objects), precision=precision)
 
 
-def _perception_of(name: str, into: Path) -> PerceptionConfig:
+# Images that tell how large the activations are: from so many frames, every so manieth.
+CALIBRATION_IMAGES, CALIBRATION_STEP = 64, 10
+
+
+def export_model(
+    name: str, out: Path, recording: Path | None, into: Path, console: Console
+) -> None:
+    """Export a detector as ONNX; see `deworldsg models export`.
+
+    Args:
+        name: of the catalogue, a folder, or a hub id.
+        out: folder to write.
+        recording: images for 8 bits; None = float32.
+        into: folder of the models.
+        console: terminal.
+
+    Raises:
+        DeWorldSGError: a detector, a package or a recording that cannot be used.
+    """
+    try:
+        from deworldsg_ros.perception.export import export_detector
+    except ImportError as error:
+        raise ConfigurationError(
+            f"the export needs torch and transformers ({error}): pip install "
+            "torch onnx onnxscript 'transformers>=5.23'"
+        ) from error
+    images = [] if recording is None else _images(recording)
+    path = into / name if name in CATALOGUE else name
+    with console.status(f"{name} …"):
+        made = export_detector(str(path), out, images)
+    bits = "8 bits in its convolutions" if images else "float32"
+    console.print(
+        f"{out}: {made.classes} classes, {made.bytes / 1e6:.1f} MB, {bits}; largest difference of "
+        f"a score to torch {made.difference:.4f}\n"
+        f"use it: --set perception.detector=onnx --set perception.detector_path={out}"
+    )
+
+
+def _images(recording: Path) -> list[UInt8]:
+    """Images at equal distances in a recording of any length, at most CALIBRATION_IMAGES."""
+    from deworldsg_ros.recordings.recording import Recording, open_source
+
+    images: list[UInt8] = []
+    step = 1
+    with closing(open_source(recording)) as source:
+        for number, frame in enumerate(Recording(source).frames()):
+            if number % step == 0:
+                images.append(frame.rgb)
+            if len(images) > CALIBRATION_IMAGES:
+                images, step = images[::2], 2 * step
+    if not images:
+        raise RecordingError(f"recording {recording}: not one frame could be used")
+    return images
+
+
+def _perception_of(name: str, into: Path, words: tuple[str, ...]) -> PerceptionConfig:
     if name == "embedded":
         return PerceptionConfig()
     if name.partition(" ")[0] in plugins("perception.detector"):
@@ -209,11 +274,15 @@ def _perception_of(name: str, into: Path) -> PerceptionConfig:
     if name not in CATALOGUE and not (folder.is_dir() or is_hub_id(name)):
         known = ", ".join([*plugins("perception.detector"), *_detectors()])
         raise ConfigurationError(f"detector '{name}': expected a folder, or one of {known}")
-    return PerceptionConfig(detector="rtdetr", detector_path=str(folder))
+    backend = detector_of(folder)
+    if backend == "open_vocabulary" and not words:
+        raise ConfigurationError(f"detector '{name}' looks for words: give --words 'mug, drill'")
+    words = words if backend == "open_vocabulary" else ()
+    return PerceptionConfig(detector=backend, detector_path=str(folder), words=words)
 
 
 def _detectors() -> list[str]:
-    return [name for name, model in CATALOGUE.items() if model.purpose == DETECTOR]
+    return [name for name, model in CATALOGUE.items() if "perception.detector" in model.purpose]
 
 
 def _in_words_of(graph: wire.SceneGraphMessage, classes: tuple[str, ...]) -> wire.SceneGraphMessage:
@@ -298,7 +367,7 @@ def get(
         list[str],
         typer.Argument(
             metavar="NAME…",
-            help="paper, embedded, detector, a name of `models list`, or OWNER/NAME of the hub",
+            help=f"{', '.join(GROUPS)}, a name of `models list`, or OWNER/NAME of the hub",
         ),
     ],
     into: IntoFolder = MODELS_FOLDER,
@@ -325,10 +394,35 @@ def measure_command(
         ),
     ],
     into: IntoFolder = MODELS_FOLDER,
+    words: Annotated[
+        str, typer.Option("--words", help="of detectors of free text: 'mug, red mug, drill'")
+    ] = "",
 ) -> None:
     """Compare detectors with the embedded one on a recording: speed, objects, precision."""
+    listed = tuple(word.strip() for word in words.split(",") if word.strip())
     with _terminal() as console:
-        measure_detectors(names[:-1], Path(names[-1]), into, console)
+        measure_detectors(names[:-1], Path(names[-1]), into, listed, console)
+
+
+@app.command("export")
+def export_command(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="a name of `models list`, a folder, or a hub id")
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write")],
+    int8: Annotated[
+        Optional[Path],
+        typer.Option(
+            "--int8",
+            metavar="RECORDING",
+            help="8 bits in the convolutions, for images like those of a recording",
+        ),
+    ] = None,
+    into: IntoFolder = MODELS_FOLDER,
+) -> None:
+    """Export a detector of fixed classes as ONNX, which runs without torch."""
+    with _terminal() as console:
+        export_model(name, out, int8, into, console)
 
 
 @app.command()

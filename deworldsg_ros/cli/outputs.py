@@ -16,8 +16,10 @@ from rich.text import Text
 
 from deworldsg_ros.base.files import check_writable, together, write_atomically
 from deworldsg_ros.base.words import visible
+from deworldsg_ros.checkpoints.catalogue import unused_detector
 from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.doctor import Finding, FrameSampler, Observations, find
+from deworldsg_ros.graph.embeddings import embeddings_path
 from deworldsg_ros.graph.graph_files import GRAPH_FILE
 from deworldsg_ros.graph.provenance import path_beside, space_path
 from deworldsg_ros.recordings.recording import Recording
@@ -38,7 +40,11 @@ CONFIG_FILE = "config.yaml"
 REPORT_FILE = "run.json"
 FRAMES_FILE = path_beside(Path(GRAPH_FILE)).name
 SPACE_FILE = space_path(Path(GRAPH_FILE)).name
-RESULTS = (CONFIG_FILE, GRAPH_FILE, PICTURE_FILE, PAGE_FILE, REPORT_FILE, FRAMES_FILE, SPACE_FILE)
+EMBEDDINGS_FILE = embeddings_path(Path(GRAPH_FILE)).name
+RESULTS = (
+    *(CONFIG_FILE, GRAPH_FILE, PICTURE_FILE, PAGE_FILE, REPORT_FILE),
+    *(FRAMES_FILE, SPACE_FILE, EMBEDDINGS_FILE),
+)
 # Rows of each printed table, to fit a screen; the page shows everything.
 MOST_ROWS = 25
 # Side of the photos in the picture.
@@ -131,6 +137,7 @@ def print_files(console: Console, out: Path) -> None:
         (GRAPH_FILE, "the graph, with surface points"),
         (FRAMES_FILE, "the frames that it comes from"),
         (SPACE_FILE, "the space that the camera saw as free"),
+        (EMBEDDINGS_FILE, "what its objects look like, as vectors"),
         (CONFIG_FILE, "the effective configuration"),
         (REPORT_FILE, "frames, drops by reason, times"),
     ):
@@ -202,6 +209,7 @@ class RunObserver:
         from deworldsg_ros.perception.stage import Perception
 
         perception, builder = pipeline.perception, pipeline.builder
+        unused, settings = unused_detector(pipeline.config.perception)
         graph = None if builder is None else pipeline.graph()
         reasons: Counter[str] = Counter()
         for counts in drops.values():
@@ -218,6 +226,8 @@ class RunObserver:
             sizes=() if graph is None else sizes_of(graph),
             turns=self._turns,
             checks=self._sampler.checks(),
+            unused_detector=unused,
+            its_settings=settings,
         )
         return find(seen)
 

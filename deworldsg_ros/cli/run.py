@@ -42,6 +42,7 @@ from deworldsg_ros.cli.terminal import frame_progress, say_instead, working
 from deworldsg_ros.config import Config
 from deworldsg_ros.doctor import Finding, find
 from deworldsg_ros.evaluation.temporal import UpdateLog
+from deworldsg_ros.graph.embeddings import write_embeddings
 from deworldsg_ros.graph.graph_files import write_graph
 from deworldsg_ros.graph.provenance import write_seen, write_space
 from deworldsg_ros.graph_builder import warm_up
@@ -296,6 +297,8 @@ def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
             seen = pipeline.builder.frames.all(pipeline.builder.graph)
             write_seen(path, wire.ns_from_stamp(graph.stamp), seen)
             write_space(path, pipeline.builder.space)
+            embeddings = pipeline.builder.graph.embeddings
+            write_embeddings(path, wire.ns_from_stamp(graph.stamp), embeddings)
         world_up = pipeline.config.inputs.world_up
         frames = processed.album.frames
         outputs.show_graph(staged, graph, console, T_world_cameras, world_up, frames)

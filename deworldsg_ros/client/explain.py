@@ -58,6 +58,9 @@ def explain_object(
     looks = f"{len(item.surface_m)} surface points" if len(item.surface_m) else "no surface points"
     size = " x ".join(f"{100 * side:.0f}" for side in item.size_m)
     lines.append(f"box {size} cm, from the {item.box_source}; {looks} in this message")
+    if item.colour_lab is not None:
+        lab = ", ".join(f"{value:.0f}" for value in item.colour_lab)
+        lines.append(f"colour: {item.colour} (CIELAB {lab})")
     lines += [f"{relation.text}: {relation.probability:.0%}" for relation in relations[:5]]
     values = {**item.to_dict(), "relations": [relation.to_dict() for relation in relations]}
     values["frames"] = _frame_values(seen)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -42,10 +42,12 @@ from deworldsg_ros.client.objects import (
     relation_of,
     scene_object,
 )
+from deworldsg_ros.client.text_tower import embed_text
+from deworldsg_ros.graph.embeddings import Looks, embeddings_path, read_embeddings
 from deworldsg_ros.graph.extent import DEFAULT_UP
 from deworldsg_ros.graph.graph_files import GRAPH_FILE, read_graph
 from deworldsg_ros.graph.provenance import SeenFrames, SeenSpace, read_seen, read_space
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.scene.vocabulary import SYMMETRIC, plain
 from deworldsg_ros.wire import messages as wire
@@ -210,6 +212,10 @@ def cheapest_chain(
 Which = SceneObject | int | str
 
 
+NO_LOOKS = (
+    "no object of the graph has an embedding: set perception.embedder, or use a detector that "
+    "gives them; live, use SceneGraphClient(embeddings=True)"
+)
 # Characters of a name in an error.
 MOST_SHOWN = 60
 
@@ -252,12 +258,14 @@ class SceneGraph:
         sequence: number of the update.
         up: unit vector against gravity; +z if the message does not tell it.
         space: the space that the camera has seen as free, for `goal_near`; None = not known.
+        looks: embeddings of objects, for `similar`; None = there are none.
     """
 
     def __init__(self, message: wire.SceneGraphMessage, seen: Iterable[SeenFrames] = ()) -> None:
         self.message = message
         self._seen = {(item.node, item.other): item for item in seen}
         self.space: SeenSpace | None = None
+        self.looks: Looks | None = None
         self.frame_id = message.frame_id
         self.stamp_ns = wire.ns_from_stamp(message.stamp)
         self.sequence = message.sequence
@@ -269,16 +277,19 @@ class SceneGraph:
 
     @classmethod
     def load(cls, path: str | Path) -> SceneGraph:
-        """The graph of a file, or of the folder of a run, with its frames and its seen space if
-        they are beside it.
+        """The graph of a file, or of the folder of a run, with its frames, its seen space and its
+        embeddings if they are beside it.
 
         Raises:
-            RefusedInput: if the file is missing or contains no scene graph.
+            RefusedInput: if the file is missing or contains no scene graph, or its embeddings
+                are damaged.
         """
         file = Path(path) / GRAPH_FILE if Path(path).is_dir() else Path(path)
         message = read_graph(file)
         graph = cls(message, read_seen(file, wire.ns_from_stamp(message.stamp)))
         graph.space = read_space(file)
+        if embeddings_path(file).is_file():
+            graph.looks = read_embeddings(embeddings_path(file), graph.stamp_ns)
         return graph
 
     def __len__(self) -> int:
@@ -507,6 +518,55 @@ class SceneGraph:
         return goal_near(
             target, self, distance, self.stamp_ns, radius=radius, towards=towards, space=seen
         )
+
+    def take_embeddings(self, path: str | Path) -> None:
+        """Take the embeddings of the map that was saved with this graph, or of another file.
+
+        Raises:
+            RefusedInput: ``unreadable_embeddings``.
+        """
+        self.looks = read_embeddings(Path(path))
+
+    def embedding(self, which: Which) -> Float32 | None:
+        """What an object looks like: a unit vector (D,); None if no frame has embedded it."""
+        node_id = self.one(which).id
+        return None if self.looks is None else self.looks.vectors.get(node_id)
+
+    def similar(
+        self, vector: Sequence[float] | Float32, k: int = 5
+    ) -> list[tuple[SceneObject, float]]:
+        """The k objects that look most like a vector (D,), with their cosines, the best first.
+
+        Raises:
+            ClientError: if no object has an embedding, or the vector does not fit.
+        """
+        if self.looks is None:
+            raise ClientError(NO_LOOKS)
+        try:
+            ranked = self.looks.similar(vector)
+        except ValueError as error:
+            raise ClientError(str(error)) from error
+        found = [(self[node_id], cosine) for node_id, cosine in ranked if node_id in self]
+        return found[: max(k, 0)]
+
+    def like(
+        self, text: str, k: int = 5, *, model: str | None = None
+    ) -> list[tuple[SceneObject, float]]:
+        """The k objects that look most like a text, with the cosines, the best first.
+
+        A cosine is no probability: those of CLIP are from 0.2 to 0.35, those of SigLIP near 0.1.
+
+        Args:
+            text: e.g. "something to drink from".
+            k: greatest number of objects.
+            model: folder or hub id of the model of the embeddings, if it is not their name here.
+
+        Raises:
+            ClientError: without embeddings, torch, transformers, or the model in the local cache.
+        """
+        if self.looks is None:
+            raise ClientError(NO_LOOKS)
+        return self.similar(embed_text(model or self.looks.model, text), k)
 
     def explain(self, what: Which | Relation | tuple[Which, Which]) -> Explanation:
         """Why something is in the graph, or is not: an object, a relation, a pair, or a class."""

@@ -22,6 +22,7 @@ from deworldsg_ros.base.words import visible
 from deworldsg_ros.client.changes import Changes
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import Point
+from deworldsg_ros.graph.embeddings import Looks
 from deworldsg_ros.scene.errors import ClientError, NoService, RefusedInput
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import MOST_WAITING, GraphFollower, GraphReplica
@@ -90,17 +91,22 @@ class SceneGraphClient:
 
     Args:
         namespace: of the robot, e.g. ``/robot_1``; empty = the topics as they are.
+        embeddings: follow `deworldsg/embeddings`, too, for `SceneGraph.similar`.
         context: rclpy context, which has to be initialised; None = one of its own.
 
     Attributes:
         refused: number of messages that could not be read.
     """
 
-    def __init__(self, namespace: str = "", context: Context | None = None) -> None:
+    def __init__(
+        self, namespace: str = "", context: Context | None = None, *, embeddings: bool = False
+    ) -> None:
         self.refused = 0
         self._own_context = context is None
         self._context = context if context is not None else Context()
         self._namespace = namespace.rstrip("/")
+        self._wants_embeddings = embeddings
+        self._looks, self._looks_session = Looks("", {}), ""
         self._replica = _ToldReplica(self._survives)
         self._follower = GraphFollower(self._replica)
         # Made from the copy when somebody asks: a large graph changes more often than that.
@@ -124,6 +130,11 @@ class SceneGraphClient:
         ):
             self._node.create_subscription(
                 String, self._namespace + topic, self._guarded(receive), _qos(depth)
+            )
+        if self._wants_embeddings:
+            topic = f"{self._namespace}/deworldsg/embeddings"
+            self._node.create_subscription(
+                String, topic, self._guarded(self._embeddings, tells=False), _qos(1)
             )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -163,6 +174,8 @@ class SceneGraphClient:
         with self._changed:
             if self._is_outdated:
                 self._graph = SceneGraph(self._replica.graph.message())
+                if self._looks.vectors and self._looks_session == self._replica.session:
+                    self._graph.looks = self._looks
                 self._is_outdated = False
             return self._graph
 
@@ -288,7 +301,9 @@ class SceneGraphClient:
             return False
         return True
 
-    def _guarded(self, receive: Callable[[Any], bool]) -> Callable[[Any], None]:
+    def _guarded(
+        self, receive: Callable[[Any], bool], *, tells: bool = True
+    ) -> Callable[[Any], None]:
         def call(message: Any) -> None:
             try:
                 with self._changed:
@@ -301,7 +316,7 @@ class SceneGraphClient:
                 logger = self._node.get_logger()
                 logger.warning(visible(str(refusal)), throttle_duration_sec=LOG_PERIOD_S)
                 return
-            if changed and self._callbacks:
+            if changed and tells and self._callbacks:
                 self._tell_changes()
 
         return call
@@ -311,6 +326,17 @@ class SceneGraphClient:
 
     def _update(self, text: str) -> bool:
         return self._follower.update(wire.decode(text, wire.SceneGraphUpdateMessage))
+
+    def _embeddings(self, text: str) -> bool:
+        message = wire.decode(text, wire.EmbeddingsMessage)
+        session = message.session if isinstance(message.session, str) else ""
+        known = self._looks if session == self._looks_session else Looks("", {})
+        try:
+            self._looks = known.after(message)
+        except ValueError as error:
+            raise RefusedInput("invalid_message", f"embeddings: {error}") from error
+        self._looks_session = session
+        return self.has_graph
 
     def _tell_changes(self) -> None:
         before, graph = self._told, self.newest

@@ -92,7 +92,9 @@ class GraphTools:
         Args:
             question: e.g. "cup on dining table", "chair within 0.5 m of table and near window",
                 "anything near (1, 2, 0.5) within 1 m", "how many cups", "largest plant",
-                "is the bear on the sofa". `notes` tell how the name of a class was taken.
+                "is the bear on the sofa", "what colour is the cup", "the red cup". `notes` tell how
+                the name of a class was taken. "like something to drink from" finds what looks like
+                a text in any words, if the graph has embeddings.
         """
         graph = self._graph()
         return {**_about(graph), **ask(graph, question).to_dict()}
@@ -254,7 +256,7 @@ def _about(graph: SceneGraph) -> dict[str, Any]:
 
 
 def _short(item: SceneObject) -> dict[str, Any]:
-    names = ("id", "label", "probability", "sure", "position_m", "size_m", "observations")
+    names = ("id", "label", "probability", "sure", "position_m", "size_m", "colour", "observations")
     values = item.to_dict()
     return {name: values[name] for name in names}
 

@@ -1,4 +1,4 @@
-"""What people call things: synonyms, kinds ("seat"), and names that are near a misspelt one.
+"""What people call things: synonyms, kinds ("seat"), colours, and names near a misspelt one.
 
 A table of ours, for the names of COCO, Objects365, ScanNet and Visual Genome that occur indoors:
 WordNet knows 100 meanings for each of them, and has to be installed.
@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import difflib
 import functools
-from collections.abc import Collection
+import itertools
+import math
+from collections import Counter
+from collections.abc import Collection, Sequence
 
 from deworldsg_ros.scene.vocabulary import (
     COCO_CLASSES,
@@ -213,3 +216,61 @@ KNOWN: frozenset[str] = frozenset(
     )
     for name in names
 )
+
+
+# --- Names of colours: the eleven basic ones of English (Berlin and Kay, 1969).
+
+COLOURS = (
+    *("black", "white", "grey", "red", "orange", "brown"),
+    *("yellow", "green", "blue", "purple", "pink"),
+)
+COLOUR_WORDS = {**{name: name for name in COLOURS}, "gray": "grey", "violet": "purple"}
+# Below this chroma, a colour is black, grey or white. Cameras give grey things a chroma of up to 8.
+GREY_CHROMA = 9.0
+# Below and above these lightnesses, it is black and white.
+BLACK_LIGHTNESS, WHITE_LIGHTNESS = 25.0, 78.0
+# How far a colour may be another one in other light, along each axis of CIELAB.
+COLOUR_STEP = 7.0
+# Names of vivid colours by hue: up to each angle, degrees.
+HUES = ((8, "pink"), (52, "red"), (82, "orange"), (112, "yellow"), (195, "green"), (309, "blue"),
+        (345, "purple"), (360, "pink"))  # fmt: skip
+
+
+def colour_name(lab: Sequence[float]) -> str:
+    """The basic colour name of a CIELAB colour (L*, a*, b*)."""
+    lightness, chroma = lab[0], math.hypot(lab[1], lab[2])
+    hue = math.degrees(math.atan2(lab[2], lab[1])) % 360.0
+    if lightness < 0.5 * BLACK_LIGHTNESS and chroma < 2.5 * GREY_CHROMA:
+        return "black"
+    # Lamps make white and grey things cream, and eyes see little chroma in what is very light.
+    is_cream = (60.0 <= hue <= 115.0 and lightness > 60.0) or lightness > 88.0
+    if chroma < GREY_CHROMA * (1.5 if is_cream else 1.0):
+        if lightness < BLACK_LIGHTNESS:
+            return "black"
+        return "white" if lightness > WHITE_LIGHTNESS else "grey"
+    name = next(name for most, name in HUES if hue <= most)
+    # Brown is dark or dull orange, and dull red and yellow; pink is light red.
+    if name == "orange" and (lightness < 60.0 or chroma < 45.0):
+        return "brown"
+    if name == "red" and lightness > 62.0:
+        return "pink"
+    if name == "red" and chroma < 38.0 and hue > 25.0:
+        return "brown"
+    if name == "yellow" and (lightness < 45.0 or chroma < 25.0) and hue < 97.0:
+        return "brown"
+    if name == "yellow" and lightness < 60.0 and hue >= 97.0:
+        return "green"
+    if name == "pink" and lightness < 45.0:
+        return "purple" if hue > 180.0 else "red"
+    return name
+
+
+@functools.lru_cache(maxsize=65_536)
+def colour_shares(lab: tuple[float, float, float]) -> dict[str, float]:
+    """How probable each name is for a colour, the best first.
+
+    The share of similar colours, 27 up to `COLOUR_STEP` away, that have the name.
+    """
+    steps = itertools.product((-COLOUR_STEP, 0.0, COLOUR_STEP), repeat=3)
+    names = Counter(colour_name([value + step for value, step in zip(lab, by)]) for by in steps)
+    return {name: count / 27 for name, count in names.most_common()}

@@ -11,7 +11,7 @@ import numpy as np
 
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.boxes import Footprint, footprint
-from deworldsg_ros.client.meanings import is_class, words_of
+from deworldsg_ros.client.meanings import colour_shares, is_class, words_of
 from deworldsg_ros.graph.extent import box_of, surface_points
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.vocabulary import PREDICATES, plain
@@ -119,6 +119,22 @@ class SceneObject:
         return self.state.label_provenance == "operator"
 
     @property
+    def colour_lab(self) -> Point | None:
+        """Mean colour of the surface, CIELAB: L*, a*, b*; None = not known."""
+        lab = self.state.colour_lab
+        return _point(lab) if isinstance(lab, list) else None
+
+    @property
+    def colour(self) -> str | None:
+        """The basic colour name that fits best, e.g. "red"; None = not known."""
+        return None if self.colour_lab is None else next(iter(colour_shares(self.colour_lab)))
+
+    def probability_of_colour(self, name: str) -> float:
+        """Probability of a name of `meanings.COLOURS` for the colour; 0 if it is not known."""
+        lab = self.colour_lab
+        return 0.0 if lab is None else colour_shares(lab).get(name, 0.0)
+
+    @property
     def height_m(self) -> float:
         """Height of the centre of the box above the origin of the world frame."""
         return float(np.dot(self.position_m, self.up))
@@ -148,6 +164,8 @@ class SceneObject:
             "size_m": _rounded(self.size_m),
             "orientation_xyzw": _rounded(self.orientation_xyzw, 4),
             "box_source": self.box_source,
+            "colour": self.colour,
+            "colour_lab": self.colour_lab,
             "frame_id": self.frame_id,
             "observations": self.observations,
             "first_seen_s": self.first_seen_ns / 1e9,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 from deworldsg_ros.base.words import counted
+from deworldsg_ros.client.grammar import RANKS, Condition, Like, Pattern, Rank, Since, parse
 from deworldsg_ros.client.graph import SceneGraph, distance_m
-from deworldsg_ros.client.meanings import is_class
+from deworldsg_ros.client.meanings import colour_shares, is_class
 from deworldsg_ros.client.objects import (
     SURE,
     HiddenObject,
@@ -20,128 +20,9 @@ from deworldsg_ros.client.objects import (
     odds_of,
 )
 from deworldsg_ros.scene.errors import ClientError
-from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 
-# --- Questions in words: "cup on dining table", "how many chairs", "is the bear on the sofa".
-#
-#     question  = "what changed" [ "since" time ] | [ "how many" | "is" ] pattern
-#     pattern   = [ rank ] thing { [ "and" ] condition }
-#     thing     = class | "anything"
-#     condition = [ "not" ] predicate thing | "near" point | rank | nearest "to" ( thing | point )
-#               | "within" length [ "of" ( thing | point ) ]
-#     rank      = "largest", "smallest", "highest", … | nearest
-#     nearest   = "closest" | "nearest" | "farthest"
-#     point     = "(" x "," y "," z ")"        length = number [ "m" | "cm" ]
-#     time      = number [ "s" ] [ "ago" ]     a stamp in seconds, or seconds before the graph's
-#     stamp
-#
-# Articles and words such as "which", "where", "there" are skipped.
-
-SKIPPED = frozenset(
-    {
-        *("a", "an", "the", "is", "are", "was", "which", "where", "find", "show", "all", "that"),
-        *("there", "any", "me", "please", "do", "you", "i", "see", "can", "it", "one", "does"),
-    }
-)
-ANYTHING = frozenset(
-    {
-        "anything",
-        "something",
-        "everything",
-        "what",
-        "thing",
-        "things",
-        "object",
-        "objects",
-        "*",
-        "?",
-    }
-)
 # Answers that are less probable are left out.
 MIN_PROBABILITY = 0.05
-# A person asks no longer question, and each takes time of the graph's thread.
-MAX_QUESTION = 500
-# What is compared, and whether most of it comes first.
-RANKS = {
-    **dict.fromkeys(("largest", "biggest"), ("size", True)),
-    "smallest": ("size", False),
-    "tallest": ("height", True),
-    **dict.fromkeys(("highest", "topmost"), ("place", True)),
-    "lowest": ("place", False),
-    **dict.fromkeys(("closest", "nearest"), ("distance", False)),
-    **dict.fromkeys(("farthest", "furthest"), ("distance", True)),
-}
-
-Kind = Literal["find", "count", "exists", "holds"]
-
-_TOKEN = re.compile(r"\([^()]*\)|[^\s,()]+|[()]")
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_LENGTH = re.compile(rf"({_NUMBER})(cm|m)?")
-
-
-@dataclass(frozen=True)
-class Condition:
-    """Conditions on an object.
-
-    Attributes:
-        predicate: of a relation; None = a distance only.
-        thing: class of the other object; None = anything.
-        point: a place instead of an object.
-        within_m: largest distance, metres.
-        is_negated: whether it has to be false.
-    """
-
-    predicate: str | None = None
-    thing: str | None = None
-    point: Point | None = None
-    within_m: float | None = None
-    is_negated: bool = False
-
-
-@dataclass(frozen=True)
-class Rank:
-    """The order of the answers; only the first one is meant.
-
-    Attributes:
-        word: of `RANKS`.
-        thing: what is near; None = the point, or nothing.
-        point: what is near.
-    """
-
-    word: str
-    thing: str | None = None
-    point: Point | None = None
-
-
-@dataclass(frozen=True)
-class Pattern:
-    """A question for objects.
-
-    Attributes:
-        thing: class; None = anything.
-        conditions: all of them have to hold.
-        kind: ``find``, ``count`` ("how many"), ``exists`` ("is there a cup"), or ``holds`` ("is the
-            cup on …": of the most probable cup, which counts as certain).
-        rank: the order of the answers; None = the most probable first.
-    """
-
-    thing: str | None
-    conditions: tuple[Condition, ...]
-    kind: Kind = "find"
-    rank: Rank | None = None
-
-
-@dataclass(frozen=True)
-class Since:
-    """A question for changes.
-
-    Attributes:
-        time_s: a stamp in seconds, or seconds before the graph's stamp; None = the first graph.
-        ago: whether `time_s` counts back from the graph's stamp.
-    """
-
-    time_s: float | None
-    ago: bool
 
 
 @dataclass(frozen=True)
@@ -189,6 +70,7 @@ class Answers:
         count: of "how many": how many of them are more probable than not; else None.
         probability: of "is there": that at least one object fulfils the question; of "is the": that
             the most probable one does, if it exists; else None.
+        colour: of "what colour": the name, and the next one if it is likely, too; else None.
     """
 
     question: str
@@ -196,10 +78,13 @@ class Answers:
     notes: tuple[str, ...] = field(default=())
     count: int | None = None
     probability: float | None = None
+    colour: str | None = None
 
     @property
     def said(self) -> str | None:
-        """The answer to "how many" or "is there" in words; None for other questions."""
+        """The answer to "how many", "is there" or "what colour"; None for other questions."""
+        if self.colour is not None:
+            return self.colour
         if self.count is not None:
             expected = sum(answer.probability for answer in self.found)
             return f"{self.count} (expected number: {expected:.1f})"
@@ -223,171 +108,11 @@ class Answers:
             values["count"] = self.count
         if self.probability is not None:
             values["probability"] = round(self.probability, 3)
+        if self.colour is not None:
+            values["colour"] = self.colour
         if self.said is not None:
             values["said"] = self.said
         return values
-
-
-def parse(question: str, predicates: Collection[str] = ()) -> Pattern | Since:
-    """Read a question.
-
-    Args:
-        question: see the top of this file.
-        predicates: further predicates, e.g. those of the graph.
-
-    Raises:
-        ClientError: if it cannot be read.
-    """
-    if len(question) > MAX_QUESTION:
-        raise ClientError(
-            f"question of {len(question)} characters: expected at most {MAX_QUESTION}"
-        )
-    tokens = _TOKEN.findall(question.strip().rstrip(" ?.!").lower())
-    if tokens[:2] == ["what", "changed"]:
-        return _since(question, tokens[2:])
-    kind: Kind = "find"
-    if tokens[:2] == ["how", "many"]:
-        kind, tokens = "count", tokens[2:]
-    elif tokens[:1] in (["is"], ["are"]):
-        kind = "holds" if tokens[1:2] == ["the"] else "exists"
-    tokens = [token for token in tokens if token not in SKIPPED]
-    return _Reader(question, tokens, _longest_first(predicates)).pattern(kind)
-
-
-class _Reader:
-    """Takes the tokens of a pattern from the left."""
-
-    def __init__(self, question: str, tokens: list[str], names: list[list[str]]) -> None:
-        self.question = question
-        self.tokens = tokens
-        self.names = names
-
-    def pattern(self, kind: Kind) -> Pattern:
-        rank = self.tokens.pop(0) if self.tokens[:1] and self.tokens[0] in RANKS else None
-        thing = self.thing()
-        ranks = [] if rank is None else [self._rank(rank)]
-        conditions = []
-        while self.tokens:
-            if self.tokens[0] in RANKS:
-                ranks.append(self._rank(self.tokens.pop(0)))
-            else:
-                conditions.append(self.condition())
-        if thing is None and not conditions and not ranks:
-            raise ClientError(f"question '{self.question}': expected a class, as in 'cup on table'")
-        if len(ranks) > 1:
-            words = " and ".join(found.word for found in ranks)
-            raise ClientError(f"question '{self.question}': {words}: expected one of them")
-        if kind == "holds" and not conditions:
-            kind = "exists"
-        return Pattern(thing, tuple(conditions), kind, ranks[0] if ranks else None)
-
-    def _rank(self, word: str) -> Rank:
-        if RANKS[word][0] != "distance":
-            return Rank(word)
-        if self.tokens[:1] in (["to"], ["from"], ["of"]):
-            self.tokens.pop(0)
-            if self.tokens and self.tokens[0].startswith("("):
-                return Rank(word, None, self._point())
-            return Rank(word, self.thing())
-        raise ClientError(
-            f"question '{self.question}': {word} to what? expected 'to' and a thing or a point"
-        )
-
-    def thing(self) -> str | None:
-        words: list[str] = []
-        while self.tokens and not self._at_condition():
-            words.append(self.tokens.pop(0))
-        name = " ".join(word for word in words if word not in ANYTHING)
-        if words:
-            return name or None
-        raise ClientError(
-            f"question '{self.question}': expected a class or 'anything' "
-            + (f"before '{' '.join(self.tokens)}'" if self.tokens else "at the end")
-        )
-
-    def condition(self) -> Condition:
-        if self.tokens[0] == "and":
-            self.tokens.pop(0)
-        if self.tokens[:1] == ["not"]:
-            self.tokens.pop(0)
-            return replace(self.condition(), is_negated=True)
-        if self.tokens[:1] == ["within"]:
-            return self._within(None, None)
-        predicate = self._predicate()
-        if predicate is None:
-            raise ClientError(
-                f"question '{self.question}': '{' '.join(self.tokens) or 'the end'}' is no "
-                "condition; expected a predicate such as on, near or within"
-            )
-        if self.tokens and self.tokens[0].startswith("("):
-            if predicate != "near":
-                raise ClientError(f"question '{self.question}': a point needs near or within")
-            return self._within(None, self._point())
-        thing = self.thing()
-        if predicate == "near" and self.tokens[:1] == ["within"]:
-            return self._within(thing, None)
-        return Condition(predicate, thing)
-
-    def _within(self, thing: str | None, point: Point | None) -> Condition:
-        """The rest of a distance; without a length, near a point means 1 m."""
-        length_m = 1.0
-        if self.tokens[:1] == ["within"]:
-            self.tokens.pop(0)
-            length_m = self._length()
-            if self.tokens[:1] == ["of"]:
-                self.tokens.pop(0)
-                if self.tokens and self.tokens[0].startswith("("):
-                    point = self._point()
-                else:
-                    thing = self.thing()
-        if thing is None and point is None:
-            raise ClientError(f"question '{self.question}': within what? expected 'of' and a thing")
-        return Condition(None, thing, point, length_m)
-
-    def _length(self) -> float:
-        text = self.tokens.pop(0) if self.tokens else ""
-        match = _LENGTH.fullmatch(text)
-        if match is None:
-            raise ClientError(f"question '{self.question}': '{text}' is no length such as 0.5 m")
-        unit = match[2] or (self.tokens.pop(0) if self.tokens[:1] in (["m"], ["cm"]) else "m")
-        return float(match[1]) * (0.01 if unit == "cm" else 1.0)
-
-    def _point(self) -> Point:
-        text = self.tokens.pop(0)
-        numbers = re.findall(_NUMBER, text)
-        if len(numbers) != 3:
-            raise ClientError(f"question '{self.question}': '{text}' is no point (x, y, z)")
-        x, y, z = map(float, numbers)
-        return x, y, z
-
-    def _at_condition(self) -> bool:
-        token = self.tokens[0]
-        is_end = token in ("and", "not", "within", "to", "from") or token in RANKS
-        return is_end or self._match() is not None
-
-    def _match(self) -> list[str] | None:
-        return next((n for n in self.names if self.tokens[: len(n)] == n), None)
-
-    def _predicate(self) -> str | None:
-        name = self._match()
-        if name is None:
-            return None
-        del self.tokens[: len(name)]
-        return " ".join(name)
-
-
-def _longest_first(predicates: Iterable[str]) -> list[list[str]]:
-    names = {plain(name) for group in PREDICATES for name in group} | set(map(plain, predicates))
-    return sorted((name.split() for name in names if name), key=lambda n: (-len(n), n))
-
-
-def _since(question: str, tokens: list[str]) -> Since:
-    match = re.fullmatch(rf"(?:since ({_NUMBER}) ?s?( ago)?)?", " ".join(tokens))
-    if match is None:
-        raise ClientError(
-            f"question '{question}': expected 'what changed since 10 s ago' or a stamp in seconds"
-        )
-    return Since(None if match[1] is None else float(match[1]), match[2] is not None)
 
 
 def absence_notes(
@@ -422,15 +147,21 @@ def ask(graph: SceneGraph, question: str) -> Answers:
     asked = parse(question, {edge.predicate for edge in graph.message.edges})
     if isinstance(asked, Since):
         return _seen_since(graph, question, asked)
+    if isinstance(asked, Like):
+        return _look_like(graph, question, asked)
     pattern, notes = _understood(graph, asked)
     items = graph.objects(pattern.thing, min_probability=MIN_PROBABILITY)
     if pattern.kind == "holds":
         items = items[:1]
+    if not any(item.colour for item in graph) and _asks_for_colour(pattern):
+        notes.append("no object of the graph has a colour: it was made by an older release")
     answers = [answer for item in items if (answer := _answer(graph, pattern, item)) is not None]
     answers.sort(key=lambda answer: (-answer.probability, answer.item.id))
     if pattern.rank is not None:
         answers, more = _ranked(graph, pattern.rank, answers)
         notes += more
+    if pattern.kind == "colour":
+        answers = answers[:1]
     if not answers:
         notes.insert(0, f"nothing fulfils this with {MIN_PROBABILITY:.0%} or more")
     chances = [answer.probability for answer in answers]
@@ -443,7 +174,38 @@ def ask(graph: SceneGraph, question: str) -> Answers:
         probability=1.0 - math.prod(1.0 - chance for chance in chances)
         if pattern.kind in ("exists", "holds")
         else None,
+        colour=_colour_in_words(answers[0].item) if pattern.kind == "colour" and answers else None,
     )
+
+
+def _asks_for_colour(pattern: Pattern) -> bool:
+    asked = [name for one in pattern.conditions for name in (one.colour, one.own_colour)]
+    of_rank = None if pattern.rank is None else pattern.rank.colour
+    return pattern.kind == "colour" or any([*asked, of_rank])
+
+
+def _colour_in_words(item: SceneObject) -> str:
+    """The colour of an object: "red", "grey or black"."""
+    if item.colour_lab is None:
+        return "its colour is not known"
+    shares = colour_shares(item.colour_lab)
+    best = max(shares.values())
+    names = [name for name, share in shares.items() if share >= 0.5 * best]
+    lightness, a, b = item.colour_lab
+    return f"{' or '.join(names[:2])} (CIELAB {lightness:.0f}, {a:.0f}, {b:.0f})"
+
+
+def _things(
+    items: Iterable[SceneObject], thing: str | None, colour: str | None
+) -> list[tuple[SceneObject, float, float]]:
+    """The objects that may be a thing of a colour, with the probabilities of both; best first."""
+    found = []
+    for item in items:
+        of_class = 1.0 if thing is None else item.probability_of(thing)
+        of_colour = 1.0 if colour is None else item.probability_of_colour(colour)
+        if of_class * of_colour >= MIN_PROBABILITY:
+            found.append((item, of_class, of_colour))
+    return sorted(found, key=lambda one: (-one[1] * one[2], one[0].id))
 
 
 def _understood(graph: SceneGraph, asked: Pattern) -> tuple[Pattern, list[str]]:
@@ -472,11 +234,11 @@ def _ranked(graph: SceneGraph, rank: Rank, answers: list[Answer]) -> tuple[list[
     """The sure answers by a rank, each with what was compared, the first one first."""
     kind, most_first = RANKS[rank.word]
     near: Point | SceneObject | None = rank.point
-    if rank.thing is not None:
-        others = graph.objects(rank.thing, min_probability=MIN_PROBABILITY)
+    if rank.thing is not None or rank.colour is not None:
+        others = _things(graph, rank.thing, rank.colour)
         if not others:
             return [], []
-        near = others[0]
+        near = others[0][0]
 
     def value(item: SceneObject) -> tuple[float, str]:
         if kind == "distance":
@@ -540,6 +302,20 @@ def _seen_since(graph: SceneGraph, question: str, since: Since) -> Answers:
     return Answers(question, tuple(answers), tuple(notes))
 
 
+def _look_like(graph: SceneGraph, question: str, asked: Like) -> Answers:
+    """The objects that look most like a text, the best first."""
+    answers = [
+        Answer(item, item.probability, (), f"cosine {cosine:.3f}")
+        for item, cosine in graph.like(asked.text)
+    ]
+    model = "" if graph.looks is None else graph.looks.model
+    notes = (
+        f"'{asked.text}': compared with the embeddings of {model}, the most similar first; the "
+        "probability is that of the object, not of the likeness",
+    )
+    return Answers(question, tuple(answers), notes)
+
+
 def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | None:
     chance = item.probability if pattern.thing is None else item.probability_of(pattern.thing)
     if chance < MIN_PROBABILITY:
@@ -550,6 +326,8 @@ def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | 
     relations = []
     chance = 1.0 if is_certain else chance
     for condition in pattern.conditions:
+        if condition.own_colour is not None and item.colour is None:
+            return None
         part = _best_part(graph, item, condition, is_certain)
         if condition.is_negated:
             held = 0.0 if part is None else part[0]
@@ -566,7 +344,10 @@ def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | 
 
 def _words(condition: Condition) -> str:
     """A condition as it is asked."""
+    if condition.own_colour is not None:
+        return condition.own_colour
     thing = condition.thing or ("anything" if condition.point is None else "the point")
+    thing = thing if condition.colour is None else f"{condition.colour} {thing}"
     if condition.predicate is None:
         return f"within {condition.within_m or 0.0:g} m of {thing}"
     return f"{condition.predicate} {thing}"
@@ -576,6 +357,9 @@ def _best_part(
     graph: SceneGraph, item: SceneObject, condition: Condition, is_certain: bool
 ) -> _Part | None:
     """The most probable way to fulfil a condition; the other object may count as certain."""
+    if condition.own_colour is not None:
+        share = item.probability_of_colour(condition.own_colour)
+        return (share, None, f"{condition.own_colour} ({share:.0%})") if share > 0 else None
     if condition.point is not None:
         is_close = distance_m(item, condition.point) <= (condition.within_m or 0.0)
         return (1.0, None, f"within {condition.within_m:g} m") if is_close else None
@@ -583,15 +367,21 @@ def _best_part(
         around = graph.objects(near=item, within=condition.within_m or 0.0)
     else:
         around = [found.object for found in graph.relations(item, condition.predicate)]
-    others: list[tuple[SceneObject, float]] = []
-    for other in sorted(dict.fromkeys(around), key=lambda other: other.id):
-        chance = 1.0 if condition.thing is None else other.probability_of(condition.thing)
-        if other.id != item.id and chance >= MIN_PROBABILITY:
-            others.append((other, chance))
+    around = [other for other in dict.fromkeys(around) if other.id != item.id]
+    others = _things(around, condition.thing, condition.colour)
     parts = [
         part
-        for other in others
-        if (part := _part(graph, item, condition, *other, 1.0 if is_certain else other[1]))
+        for other, chance, of_colour in sorted(others, key=lambda one: one[0].id)
+        if (
+            part := _part(
+                graph,
+                item,
+                condition,
+                other,
+                chance * of_colour,
+                of_colour if is_certain else chance * of_colour,
+            )
+        )
     ]
     return max(parts, key=lambda part: part[0], default=None)
 

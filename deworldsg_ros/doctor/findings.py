@@ -371,6 +371,17 @@ def _detector(seen: Observations) -> Iterator[Finding]:
         )
 
 
+def _unused(seen: Observations) -> Iterator[Finding]:
+    if seen.unused_detector:
+        yield Finding(
+            "unused_detector",
+            f"A stronger detector is in {seen.unused_detector}, and the embedded one was used.",
+            "The embedded one is the default: it is small, and knows 80 classes.",
+            f"To use it: {seen.its_settings}.",
+            harmless=True,
+        )
+
+
 def _looks(seen: Observations) -> Iterator[Finding]:
     if not seen.frames:
         return
@@ -414,5 +425,6 @@ CHECKS: tuple[Check, ...] = (
     _poses,
     _turned,
     _detector,
+    _unused,
     _looks,
 )

@@ -61,6 +61,9 @@ class Observations:
         incompatible: topics whose publisher and subscriber never match in QoS, in words.
         behind_s: seconds from the stamp of a topic's newest message to the clock.
         found_nodes: whether nodes of this package run; None = it was not looked for.
+        unused_detector: folder of a stronger detector than the embedded one, which was used; "" =
+            none.
+        its_settings: options that use it.
     """
 
     images: int | None = None
@@ -79,6 +82,8 @@ class Observations:
     incompatible: tuple[str, ...] = ()
     behind_s: Mapping[str, float] = field(default_factory=dict)
     found_nodes: bool | None = None
+    unused_detector: str = ""
+    its_settings: str = ""
 
 
 # --- Checks of a few frames: do depth and colour agree, and do the poses fit the images?

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,13 +33,15 @@ from deworldsg_ros.perception.protocols import Detections, Detector
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived, Perception
 from deworldsg_ros.pipeline import Perceiver
+from deworldsg_ros.poses.odometry import track_poses
+from deworldsg_ros.poses.trajectory import PoseNoise, perturb_poses, read_trajectory
 from deworldsg_ros.recordings.folders.annotations import Annotations, ScanAnnotation, ScanPoints
 from deworldsg_ros.recordings.folders.dataset import decode_image, read_file
-from deworldsg_ros.recordings.folders.sequence import SequenceDataset, read_instances
+from deworldsg_ros.recordings.folders.sequence import SequenceDataset, read_instances, rotated_pose
 from deworldsg_ros.recordings.source import Source
 from deworldsg_ros.scene.arrays import UInt8, UInt16
-from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.scene.errors import EvaluationError
+from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
+from deworldsg_ros.scene.errors import EvaluationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
 
@@ -550,3 +554,83 @@ def _frame_numbers(annotations: Annotations, scan: str, source: Source) -> Mappi
 # detections.
 
 __all__ = ["Faults", "FrontEndChoice", "build_front_end", "parse_faults"]
+
+
+# --- Sources of the camera poses of an evaluation, as picklable values.
+
+PoseKind = Literal["ground-truth", "slam", "odometry", "perturbed"]
+POSE_KINDS: tuple[PoseKind, ...] = ("ground-truth", "slam", "odometry", "perturbed")
+# Drift of 2 % and 1 degree per metre, and jitter of a hand-held camera: worse than good SLAM.
+PERTURBATION = PoseNoise(jitter_m=0.005, jitter_deg=0.2, drift_m_per_m=0.02, drift_deg_per_m=1.0)
+
+
+@dataclass(frozen=True)
+class PoseSource:
+    """A source of poses. All sources start at the first ground-truth pose.
+
+    Attributes:
+        kind: ``ground-truth`` of the data set, ``slam`` from the .slam.pose.txt of the frames,
+            ``odometry`` from the images, or ``perturbed`` ground truth.
+        noise: noise of ``perturbed``.
+
+    Raises:
+        EvaluationError: an unknown kind.
+    """
+
+    kind: PoseKind = "ground-truth"
+    noise: PoseNoise = PERTURBATION
+
+    def __post_init__(self) -> None:
+        if self.kind not in POSE_KINDS:
+            raise EvaluationError(f"--poses {self.kind}: expected {', '.join(POSE_KINDS)}")
+
+
+def repose(
+    frames: Iterator[RgbdFrame],
+    poses: PoseSource,
+    source: Source,
+    drops: Counter[str],
+) -> Iterator[RgbdFrame]:
+    """The frames with the chosen poses. Frames without a pose are dropped and counted in `drops`.
+
+    Raises:
+        DeWorldSGError: a trajectory cannot be read.
+    """
+    if poses.kind == "ground-truth":
+        return frames
+    if poses.kind == "perturbed":
+        return perturb_poses(frames, poses.noise)
+    first = next(frames, None)
+    if first is None:
+        return frames
+    again = chain([first], frames)
+    if poses.kind == "slam":
+        if not isinstance(source, SequenceDataset):
+            raise EvaluationError(
+                "--poses slam: the recording has no frame-NNNNNN.slam.pose.txt; use other poses"
+            )
+        return _of_slam(again, source, drops)
+
+    def lost(refusal: RefusedInput) -> None:
+        drops[refusal.reason] += 1
+
+    return track_poses(again, first.T_world_camera, lost)
+
+
+def _of_slam(
+    frames: Iterator[RgbdFrame], dataset: SequenceDataset, drops: Counter[str]
+) -> Iterator[RgbdFrame]:
+    trajectory = read_trajectory(dataset.sequence, "slam")
+    T_truth_slam = None
+    for index, frame in enumerate(frames):
+        number = dataset.frame_numbers[frame.stamp_ns]
+        T_slam_camera = trajectory.at(frame.stamp_ns, number, index, 0)
+        if T_slam_camera is None:
+            drops["no_slam_pose"] += 1
+            continue
+        # Trackers process the images as stored; `rotated` data sets rotate them when they are read.
+        T_slam_camera = rotated_pose(T_slam_camera) if dataset.rotated else T_slam_camera
+        if T_truth_slam is None:
+            # The SLAM world starts at its first camera: align that pose with the ground truth.
+            T_truth_slam = frame.T_world_camera @ invert_pose(T_slam_camera)
+        yield replace(frame, T_world_camera=T_truth_slam @ T_slam_camera)

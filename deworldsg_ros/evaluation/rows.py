@@ -14,8 +14,7 @@ from deworldsg_ros.checkpoints.catalogue import (
     missing_world_model,
 )
 from deworldsg_ros.config import Config, RelationsConfig, to_mapping
-from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
-from deworldsg_ros.evaluation.pose_sources import PoseSource
+from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice, PoseSource
 from deworldsg_ros.evaluation.runner import PIPELINE
 from deworldsg_ros.poses.trajectory import PoseNoise
 from deworldsg_ros.scene.errors import EvaluationError

@@ -25,14 +25,13 @@ from deworldsg_ros.checkpoints.catalogue import WORLD_MODELS, require_checkpoint
 from deworldsg_ros.config import Config, RelationsConfig, to_yaml
 from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
 from deworldsg_ros.evaluation.edge_measures import EDGES_FILE, write_edge_list
-from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice, PoseSource, build_front_end, repose
 from deworldsg_ros.evaluation.graph_measures import (
     Measures,
     ReferenceScene,
     measure,
     read_reference,
 )
-from deworldsg_ros.evaluation.pose_sources import PoseSource, repose
 from deworldsg_ros.evaluation.predictions import ScanPrediction
 from deworldsg_ros.evaluation.recorded_room import open_annotations
 from deworldsg_ros.evaluation.scoring import ProtocolOptions, ScanResult, score_scan

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.graph.edits import Edit, EditLog
+from deworldsg_ros.graph.embeddings import NodeEmbeddings
 from deworldsg_ros.graph.extent import even_moments
 from deworldsg_ros.graph.nodes import SAVED, IdState, NodeIds, NodeTable, Observations
 from deworldsg_ros.graph.pairs import (
@@ -45,6 +46,7 @@ class GraphState:
         pairs: evidence of edges, and votes.
         ids: the id memory.
         edits: of an operator, oldest first.
+        embeddings: `NodeEmbeddings.arrays`.
     """
 
     vocabulary: Vocabulary
@@ -58,6 +60,7 @@ class GraphState:
     remembered_frames: int
     even_gaussians: bool
     edits: Sequence[Edit] = ()
+    embeddings: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
 
 class GlobalGraph:
@@ -74,6 +77,7 @@ class GlobalGraph:
         nodes: the nodes as parallel arrays; read only.
         pairs: what is known about pairs of nodes, by slots.
         edits: what an operator has said about nodes; read only.
+        embeddings: what some of the nodes look like; read only.
         even_gaussians: messages show the `even_moments` of a node's surface instead of the pooled
             Gaussian.
     """
@@ -96,6 +100,7 @@ class GlobalGraph:
         # The newest vocabulary of a frame, the graph's at that time, and its columns there.
         self._translated: tuple[Vocabulary, Vocabulary, Int64 | None]
         self._translated = (vocabulary, vocabulary, None)
+        self.embeddings = NodeEmbeddings()
         self._ids = NodeIds(self.nodes, remembered_frames)
         self._watchers: list[dict[int, int]] = []
         self.pairs = PairStore(self.nodes, len(vocabulary.predicates))
@@ -114,6 +119,7 @@ class GlobalGraph:
         graph.pairs.restore(state.pairs)
         graph._ids = NodeIds(graph.nodes, state.remembered_frames, state.ids)
         graph.edits = EditLog(state.edits)
+        graph.embeddings.restore(state.embeddings, graph.nodes.ids)
         return graph
 
     def state(self) -> GraphState:
@@ -132,6 +138,7 @@ class GlobalGraph:
             remembered_frames=self.remembered_frames,
             even_gaussians=self.even_gaussians,
             edits=list(self.edits.edits),
+            embeddings=self.embeddings.arrays(),
         )
 
     def __len__(self) -> int:
@@ -223,6 +230,35 @@ class GlobalGraph:
             self.nodes.class_probabilities[slots] = classes_after
         self._changed(slots)
 
+    def add_colours(self, local: LocalGraph, node_ids: Sequence[int]) -> None:
+        """Add the colours of a frame, weighted by pixels, to its nodes (0 = none)."""
+        if local.colours_lab is None:
+            return
+        slot_of = self.nodes.slot_of
+        slots = np.array([slot_of.get(node_id, -1) for node_id in node_ids], np.int64)
+        known = (slots >= 0) & ~np.isnan(local.colours_lab).any(axis=1)
+        weights = local.pixel_counts[known, None].astype(np.float64)
+        # Two rows of a frame may be one node.
+        seen = np.concatenate([weights * local.colours_lab[known], weights], axis=1)
+        np.add.at(self.nodes.colours, slots[known], seen)
+        self._changed(slots[known])
+
+    def add_embeddings(self, local: LocalGraph, node_ids: Sequence[int]) -> None:
+        """Add the embeddings of a frame to its nodes (0 = none).
+
+        Raises:
+            RefusedInput: ``embedding_model_mismatch``; nothing is added then.
+        """
+        seen = local.embeddings
+        if seen is None:
+            return
+        self.embeddings.check_fits(seen)
+        for row, vector in zip(seen.rows.tolist(), seen.vectors):
+            slot = self.nodes.slot_of.get(node_ids[row])
+            if slot is not None:
+                direction = local.T_world_camera[:3, 3] - self.nodes.means[slot]
+                self.embeddings.add(node_ids[row], direction, vector, seen.model)
+
     def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
         """Remove some of the surface points of n live nodes; see `NodeTable.drop_points`."""
         self._changed(self.nodes.drop_points(self.nodes.slots_of(node_ids), dropped))
@@ -260,6 +296,8 @@ class GlobalGraph:
         """Apply a pose correction (4, 4), from the old world frame to the new, to a live node."""
         slot = self.nodes.slot(node_id)
         self.nodes.move(slot, T_correction)
+        if self.embeddings.views:
+            self.embeddings.turn(node_id, T_correction[:3, :3])
         self._changed([slot])
 
     def resolve(self, node_id: int) -> int:
@@ -318,6 +356,8 @@ class GlobalGraph:
         kept_id, removed_id = min(a_id, b_id), max(a_id, b_id)
         slot, removed = self.nodes.slot(kept_id), self.nodes.slot(removed_id)
         self.nodes.merge(slot, removed)
+        if self.embeddings.views:
+            self.embeddings.merge(kept_id, removed_id)
         self._changed([slot])
         self.pairs.merge(removed, slot)
         self._remove(removed_id, kept_id)
@@ -331,6 +371,8 @@ class GlobalGraph:
         """
         slot, new = self.nodes.slot(old_id), self.nodes.slot(new_id)
         self.nodes.take_over(slot, new)
+        if self.embeddings.views:
+            self.embeddings.merge(old_id, new_id)
         self._changed([slot])
         self.pairs.drop(slot)
         self.pairs.merge(new, slot)
@@ -464,6 +506,8 @@ class GlobalGraph:
         for watcher in self._watchers:
             watcher[node_id] = self.nodes.slot(node_id)
         self.nodes.remove(node_id)
+        if self.embeddings.views:
+            self.embeddings.remove(node_id)
         self._ids.retire(node_id, successor)
         if self.edits:
             self._drop(self.edits.removed(node_id, successor))
@@ -502,9 +546,10 @@ def copy_node(
     confirmed = bool(nodes.confirmed[slot])
     new_id = graph.add_node(mean, covariance, classes, first_ns, surface, weight, confirmed)
     new = nodes.slot(new_id)
-    for name in ("class_probabilities", "observations", "existence", "last_seen_ns"):
+    for name in ("class_probabilities", "observations", "existence", "last_seen_ns", "colours"):
         getattr(nodes, name)[new] = getattr(nodes, name)[slot]
     graph.copy_relations(node_id, new_id, without)
+    graph.embeddings.copy(node_id, new_id)
     return new_id
 
 

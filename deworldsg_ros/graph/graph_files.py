@@ -128,6 +128,13 @@ def _check_nodes(arrays: ArraysByName, header: Header) -> None:
     if "existence" in arrays:  # not in files of older releases
         existence = checked(arrays, "existence", np.float64, count)
         within("existence", existence[existence != -1.0], 0.0, 1.0)
+    if "colours" in arrays:  # nor this
+        colours = checked(arrays, "colours", np.float64, count, 4)
+        pixels = colours[:, 3:]
+        within("colours (pixels)", pixels, 0, MAX_COUNT * limits.MAX_SIDE_PX**2)
+        most = limits.MAX_LAB * (1 + 1e-9) * pixels
+        holds("colours", (np.abs(colours[:, :3]) <= most).all(), f"means up to {limits.MAX_LAB:g}")
+        holds("colours (lightness)", (colours[:, 0] >= 0).all(), "0 or more")
     first = checked(arrays, "first_seen_ns", np.int64, count)
     last = checked(arrays, "last_seen_ns", np.int64, count)
     _check_stamps("first_seen_ns", first)
@@ -289,6 +296,7 @@ def to_arrays(state: GraphState) -> Arrays:
         **vars(state.pairs),
         **_id_arrays(state.ids),
         **_edit_arrays(state),
+        **state.embeddings,
     }
 
 
@@ -344,6 +352,7 @@ def _state(arrays: Arrays) -> GraphState:
         remembered_frames=header.remembered_frames,
         even_gaussians=header.even_gaussians,
         edits=edits,
+        embeddings=arrays,
     )
 
 
@@ -363,8 +372,12 @@ def header_of(arrays: Arrays) -> Header:
 
 
 def _column(arrays: Arrays, name: str) -> NDArray[Any]:
-    if name == "existence" and name not in arrays:  # files of older releases
-        return np.full(len(arrays["ids"]), -1.0)
+    if name not in arrays:  # files of older releases
+        count = len(arrays["ids"])
+        if name == "existence":
+            return np.full(count, -1.0)
+        if name == "colours":
+            return np.zeros((count, 4))
     return arrays[name]
 
 

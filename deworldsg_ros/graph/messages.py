@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.graph.extent import (
@@ -255,10 +255,11 @@ class NodeStates:
         nodes, slots = self._graph.nodes, np.array(list(present.values()), np.int64)
         vocabulary, labels = self._graph.vocabulary, self._graph.edits.labels
         columns = (nodes.observations, nodes.existence, nodes.first_seen_ns, nodes.last_seen_ns)
-        for node_id, classes, pooled, observations, existence, first_ns, last_ns in zip(
+        for node_id, classes, pooled, colour, observations, existence, first_ns, last_ns in zip(
             present,
             listed(nodes.class_probabilities[slots], vocabulary.classes, self._top_k),
             rounded_gaussians(nodes.means, nodes.covariances, slots),
+            _colours(nodes.colours[slots]),
             *(column[slots].tolist() for column in columns),
         ):
             label = labels.get(node_id)
@@ -283,6 +284,7 @@ class NodeStates:
                 last_seen=wire.stamp_from_ns(last_ns),
                 entropy_nats=classes.entropy_nats,
                 label_provenance=UNSET if label is None else "operator",
+                colour_lab=colour,
             )
 
     def _known_extent(self, node_id: int) -> Extent | None:
@@ -290,6 +292,12 @@ class NodeStates:
         if state.box is UNSET:
             return None
         return Extent(state.mean_m, state.covariance_m2, state.box)
+
+
+def _colours(sums: Float64) -> list[list[float] | UnsetType]:
+    """Mean colours of n nodes, by `NodeTable.colours`; CIELAB with one decimal."""
+    means = (sums[:, :3] / np.maximum(sums[:, 3:], 1.0)).round(1) + 0.0
+    return [mean if n else UNSET for mean, n in zip(means.tolist(), sums[:, 3].tolist())]
 
 
 def hidden_node(graph: GlobalGraph, node_id: int, reason: str) -> wire.HiddenNode:

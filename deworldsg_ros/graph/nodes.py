@@ -157,6 +157,7 @@ SAVED = (
     "existence",
     "first_seen_ns",
     "last_seen_ns",
+    "colours",
 )
 
 
@@ -221,6 +222,8 @@ class NodeTable:
         surface_points_world: (n, K, 3) float32, metres: a sample of each node's surface points, of
         surface_counts: (n,) int64 points; see `surface`. K grows up to the capacity.
         surface_revisions: (n,) int64, number of changes of the surface so far.
+        colours: (n, 4) float64, sums over the frames of w L, w a, w b (CIELAB), and w, the number
+            of pixels; 0 = not known.
         slot_of: the slot of each id; read only.
     """
 
@@ -239,6 +242,7 @@ class NodeTable:
     surface_points_world: Float32
     surface_counts: Int64
     surface_revisions: Int64
+    colours: Float64
 
     def __init__(self, class_count: int, surface_point_capacity: int = 0) -> None:
         points = min(FIRST_POINTS, surface_point_capacity)
@@ -258,6 +262,7 @@ class NodeTable:
             "surface_points_world": (np.float32, (points, 3)),
             "surface_counts": (np.int64, ()),
             "surface_revisions": (np.int64, ()),
+            "colours": (np.float64, (4,)),
         }
         # With room for more; the attributes are views of the slots that were ever used.
         self._storage: dict[str, NDArray[Any]] = {
@@ -365,19 +370,21 @@ class NodeTable:
     def merge(self, slot: int, other: int) -> None:
         """Fuse everything that was observed of another node into a node."""
         self.fuse(np.array([slot]), self._observed(other))
+        self.colours[slot] += self.colours[other]
         self.confirmed[slot] |= self.confirmed[other]
         self.existence[slot] = max(self.existence[slot], self.existence[other])
 
     def take_over(self, slot: int, other: int) -> None:
         """Give a node the Gaussian, surface and state of another one.
 
-        Class distributions average with the numbers of observations, which add up.
+        Class distributions average with the numbers of observations, which add up. So do colours.
         """
         counts = self.observations[[slot, other]]
         classes = counts @ self.class_probabilities[[slot, other]] / counts.sum()
         gaussian = self.means[other].copy(), self.covariances[other].copy()
         self.put(slot, *gaussian, classes, float(self.weights[other]), int(counts.sum()))
         self.set_surface(slot, self.surface(other))
+        self.colours[slot] += self.colours[other]
         self.confirmed[slot], self.existence[slot] = self.confirmed[other], self.existence[other]
         self.last_seen_ns[slot] = self.last_seen_ns[other]
 

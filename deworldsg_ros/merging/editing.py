@@ -239,7 +239,7 @@ def _cut_pixels(
 
 
 def _with_objects(local: LocalGraph, objects: list[_Object], grid: DepthGrid | None) -> LocalGraph:
-    """The frame with other objects; merging needs neither their boxes nor their relations."""
+    """The frame with other objects; merging needs no boxes, relations and colours."""
     return derived(
         local,
         instance_ids=np.array([item.value for item in objects]),
@@ -251,6 +251,8 @@ def _with_objects(local: LocalGraph, objects: list[_Object], grid: DepthGrid | N
         surface_points_world=tuple([item.points for item in objects]),
         relations=Relations.none(len(local.vocabulary.predicates)),
         depth_grid=grid,
+        colours_lab=None,
+        embeddings=None,
     )
 
 

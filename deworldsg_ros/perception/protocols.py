@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, MaskPatch
-from deworldsg_ros.scene.frame_graph import Relations
+from deworldsg_ros.scene.frame_graph import Embeddings, Relations
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,8 @@ class Detections:
         classes: names of the C classes, if they are not those of the detector at all times: a
             detector of free text learns new ones, always at the end; None = `Detector.classes`.
         masks: n masks, if the detector has them: then no segmenter runs; None = none.
-        embeddings: (n, D) float32, what the image shows of each object; None = none.
+        embeddings: (n, D) float32, what the image shows of each object, of any length; a row that
+            is 0 or not finite = not of this object; None = none.
         embedding_model: name of the model that made the embeddings.
     """
 
@@ -49,6 +51,8 @@ class Detections:
             values = getattr(self, name)
             if values is not None and len(values) != count:
                 raise ValueError(f"{count} scores, {len(values)} {name}; expected as many")
+        if self.embeddings is not None:
+            unit_embeddings(self.embeddings[:0], np.zeros(0, np.int64), self.embedding_model)
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -65,6 +69,23 @@ class Detections:
             masks=None if self.masks is None else tuple([self.masks[row] for row in kept]),
             embeddings=None if self.embeddings is None else self.embeddings[rows],
         )
+
+
+def unit_embeddings(vectors: Float32, rows: Int64, model: str) -> Embeddings:
+    """Embeddings of the objects of `rows` (m,), scaled to length one.
+
+    Args:
+        vectors: (m, D) float32; rows that are 0 or not finite are left out.
+        rows: ascending.
+        model: that made them.
+
+    Raises:
+        ValueError: more than 2048 values, or no name of the model.
+    """
+    lengths = np.linalg.norm(vectors.astype(np.float64), axis=1)
+    kept = np.isfinite(lengths) & (lengths > 0)
+    unit = (vectors[kept] / lengths[kept, None]).astype(np.float16)
+    return Embeddings(rows[kept], unit, model)
 
 
 class Detector(Protocol):
@@ -109,6 +130,17 @@ class Segmenter(Protocol):
         Returns:
             n masks, in the order of the boxes.
         """
+
+
+class Embedder(Protocol):
+    """Crops of objects to vectors."""
+
+    @property
+    def model_name(self) -> str:
+        """Name of the model, by which its texts can be found."""
+
+    def embed(self, crops: Sequence[UInt8]) -> Float32:
+        """(n, D) float32 vectors of n >= 1 crops, (h, w, 3) uint8 in RGB order each."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import msgspec
 
 from deworldsg_ros.base.plugins import PluginError, load_plugin
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.perception.protocols import Detector, RelationHead, Segmenter
+from deworldsg_ros.perception.protocols import Detector, Embedder, RelationHead, Segmenter
 from deworldsg_ros.perception.stage import Perception
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
@@ -30,11 +30,24 @@ def _nanodet(config: PerceptionConfig) -> Detector:
     return NanoDetDetector(threads=config.threads)
 
 
-def _rtdetr(config: PerceptionConfig) -> Detector:
+def _transformers(config: PerceptionConfig) -> Detector:
     with _torch("perception.detector", config.detector, config):
-        from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
+        from deworldsg_ros.perception.backends.closed_set import ClosedSetDetector
 
-    return RtDetrDetector(config)
+    return ClosedSetDetector(config)
+
+
+def _open_vocabulary(config: PerceptionConfig) -> Detector:
+    with _torch("perception.detector", config.detector, config):
+        from deworldsg_ros.perception.backends.open_vocabulary import OpenVocabularyDetector
+
+    return OpenVocabularyDetector(config)
+
+
+def _onnx(config: PerceptionConfig) -> Detector:
+    from deworldsg_ros.perception.backends.onnx_detector import OnnxDetector
+
+    return OnnxDetector(config)
 
 
 def _topic(config: PerceptionConfig) -> Detector:
@@ -83,19 +96,30 @@ def _geometric(config: PerceptionConfig, detector: Detector) -> RelationHead:
 
 def _egtr(config: PerceptionConfig, detector: Detector) -> RelationHead:
     with _torch("perception.relation_head", config.relation_head, config):
-        from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead
+        from deworldsg_ros.perception.backends.closed_set import EgtrRelationHead
 
     return EgtrRelationHead(config, detector)
 
 
+def _embedder(config: PerceptionConfig) -> Embedder:
+    with _torch("perception.embedder", config.embedder, config):
+        from deworldsg_ros.perception.backends.embedder import ImageEmbedder
+
+    return ImageEmbedder(config)
+
+
 DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
     "nanodet": _nanodet,
-    "rtdetr": _rtdetr,
+    "transformers": _transformers,
+    # The same, by the name of the paper's detector.
+    "rtdetr": _transformers,
+    "open_vocabulary": _open_vocabulary,
+    "onnx": _onnx,
     "topic": _topic,
 }
 # Torch has one setting of its threads for the thread that sets it, and a GPU takes one frame after
 # the other anyway.
-THREAD_SAFE_DETECTORS = {"nanodet"}
+THREAD_SAFE_DETECTORS = {"nanodet", "onnx"}
 SEGMENTERS: dict[str, Callable[[PerceptionConfig], Segmenter]] = {
     "rgbd": _rgbd,
     "sam2": _sam2,
@@ -141,7 +165,13 @@ def build_perception(
         detector = make_detector(config)
     head = make_head(config, detector)
     return Perception(
-        detector, make_segmenter(config), head, config, world_up=world_up, detectors=detectors
+        detector,
+        make_segmenter(config),
+        head,
+        config,
+        world_up=world_up,
+        detectors=detectors,
+        embedder=_embedder(config) if config.embedder else None,
     )
 
 

@@ -3,93 +3,50 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.protocols import (
     Detections,
     Detector,
+    Embedder,
     RelationHead,
     SegmentedObjects,
     Segmenter,
+    unit_embeddings,
 )
 from deworldsg_ros.perception.source import DetectionSource
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16, areas, shared_areas
-from deworldsg_ros.scene.camera import Intrinsics, MaskPatch, RgbdFrame, UpEstimator, quarter_turns
+from deworldsg_ros.scene.arrays import (
+    Bool,
+    Float32,
+    Float64,
+    Int64,
+    UInt8,
+    UInt16,
+    areas,
+    shared_areas,
+)
+from deworldsg_ros.scene.camera import (
+    Intrinsics,
+    MaskPatch,
+    RgbdFrame,
+    UpEstimator,
+    Uprighter,
+    UprightFrame,
+)
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import Embeddings, FrameGraph, Relations, Vocabulary
 from deworldsg_ros.scene.limits import check_names
 
-# --- Frames of a camera that is mounted on its side, turned upright for the detector.
-#
-# A quarter turn moves pixels and does not change them: the pixel (u, v) of an image of width W
-# becomes (v, W - 1 - u). Boxes and instances are turned back exactly.
-
-# R_camera_turned of one quarter turn: the new x axis is y, the new y axis is -x.
-QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-@dataclass(frozen=True)
-class UprightFrame:
-    """A frame, and the same frame turned upright.
-
-    Attributes:
-        original: as the camera took it.
-        upright: the same object if it needs no turn.
-        turns: quarter turns counter-clockwise from `original` to `upright`, 0 to 3.
-    """
-
-    original: RgbdFrame
-    upright: RgbdFrame
-    turns: int = 0
-
-
-class Uprighter:
-    """Decides for each frame, in order of time, how it is turned.
-
-    The turn changes only when up is clearly in the direction of another side of the image. A camera
-    that looks straight down keeps its turn.
-
-    Args:
-        world_up: as `UpEstimator`.
-    """
-
-    def __init__(self, world_up: str) -> None:
-        self._up = UpEstimator(world_up)
-        self._turns = 0
-
-    def turn(self, frame: RgbdFrame) -> UprightFrame:
-        """The frame, upright."""
-        self._up.observe(frame.T_world_camera)
-        turns = quarter_turns(frame.T_world_camera[:3, :3].T @ self._up.up_world())
-        self._turns = self._turns if turns is None else turns
-        return UprightFrame(frame, turned(frame, self._turns), self._turns)
-
-
-def turned(frame: RgbdFrame, turns: int) -> RgbdFrame:
-    """A frame after so many quarter turns counter-clockwise; its pose is that of the turned camera.
-
-    The same object for no turn.
-    """
-    if turns % 4 == 0:
-        return frame
-    intrinsics, T_world_camera = frame.intrinsics, frame.T_world_camera.copy()
-    for _ in range(turns % 4):
-        i = intrinsics
-        intrinsics = Intrinsics(i.fy, i.fx, i.cy, i.width - 1 - i.cx, i.height, i.width)
-        T_world_camera[:3, :3] = T_world_camera[:3, :3] @ QUARTER_TURN
-    return replace(
-        frame,
-        rgb=np.ascontiguousarray(np.rot90(frame.rgb, turns)),
-        depth_m=np.ascontiguousarray(np.rot90(frame.depth_m, turns)),
-        intrinsics=intrinsics,
-        T_world_camera=T_world_camera,
-    )
+# --- The results of a frame that was turned upright, for the image as the camera took it: boxes and
+# instances are turned back exactly.
 
 
 def turned_back(
@@ -270,6 +227,103 @@ def instance_image(
     return labels
 
 
+# --- The colour of each object.
+
+# Pixels of the patch around an object of which the colours are taken, evenly spaced: about as many.
+COLOUR_SAMPLES = 200
+# Factors and offsets from the 8-bit CIELAB of OpenCV.
+LAB_SCALE, LAB_OFFSET = np.array([100.0 / 255.0, 1.0, 1.0]), np.array([0.0, 128.0, 128.0])
+
+
+def mean_colours(
+    rgb: UInt8, instances: UInt16, windows: Sequence[tuple[slice, slice]]
+) -> Float32 | None:
+    """Mean colour of each object, in CIELAB.
+
+    Half of its pixels count, those of medium lightness: neither the highlights nor the shadows, nor
+    what a mask contains of a lighter or darker background.
+
+    Args:
+        rgb: (H, W, 3) uint8, RGB order.
+        instances: (H, W) uint16 instance image.
+        windows: n slices of rows and columns around the objects.
+
+    Returns:
+        (n, 3) float32; a row of NaN for an object without a sampled pixel. None if no object has a
+        colour.
+    """
+    samples = []
+    for row, (rows, columns) in enumerate(windows):
+        area = (rows.stop - rows.start) * (columns.stop - columns.start)
+        step = max(1, round(math.sqrt(area / COLOUR_SAMPLES)))
+        of_object = instances[rows, columns][step // 2 :: step, step // 2 :: step] == row + 1
+        samples.append(rgb[rows, columns][step // 2 :: step, step // 2 :: step][of_object])
+    counts = np.array([len(pixels) for pixels in samples], np.int64)
+    if not counts.any():
+        return None
+    lab = cv2.cvtColor(np.concatenate(samples)[:, None], cv2.COLOR_RGB2Lab)[:, 0]
+    colours = np.full((len(counts), 3), np.nan, np.float32)
+    ends = counts.cumsum()
+    for row in np.flatnonzero(counts).tolist():
+        own = lab[ends[row] - counts[row] : ends[row]]
+        quarter = counts[row] // 4
+        medium = own[:, 0].argsort(kind="stable")[quarter : counts[row] - quarter]
+        colours[row] = (own[medium].mean(axis=0) - LAB_OFFSET) * LAB_SCALE
+    return colours
+
+
+# --- Which objects are embedded: a few a second, each after another while.
+
+# Objects of which a vector is computed in a second of the frames' time; as many at once at most.
+EMBEDDED_PER_S = 2.0
+# Objects that are remembered as embedded.
+MOST_EMBEDDED = 64
+# An object is the one of an earlier frame if their boxes overlap by this fraction of their union.
+# Another view of it counts as new.
+SAME_BOX = 0.3
+# The crop is the square around the box, and this fraction of its side more.
+CROP_MARGIN = 0.1
+
+
+class EmbeddingQueue:
+    """Chooses the objects of a frame to embed: those that waited longest, then the largest."""
+
+    def __init__(self) -> None:
+        self._budget = 1.0
+        self._last_ns: int | None = None
+        self._boxes = np.zeros((0, 4))
+        self._stamps_ns = np.zeros(0, np.int64)
+
+    def choose(self, boxes_xyxy: Float64, stamp_ns: int) -> list[int]:
+        """Rows of boxes (n, 4), ascending; the frames come in order of time."""
+        if self._last_ns is not None:
+            passed_s = max(stamp_ns - self._last_ns, 0) / 1e9
+            self._budget = min(self._budget + EMBEDDED_PER_S * passed_s, EMBEDDED_PER_S)
+        self._last_ns = stamp_ns
+        count = min(int(self._budget + 1e-6), len(boxes_xyxy))
+        if not count:
+            return []
+        shared = shared_areas(boxes_xyxy, self._boxes)
+        sizes = areas(boxes_xyxy)
+        unions = sizes[:, None] + areas(self._boxes)[None] - shared
+        seen_ns = np.where(shared > SAME_BOX * unions, self._stamps_ns, -1).max(axis=1, initial=-1)
+        rows = sorted(np.lexsort((-sizes, seen_ns))[:count].tolist())
+        self._budget -= count
+        self._boxes = np.concatenate([self._boxes, boxes_xyxy[rows]])[-MOST_EMBEDDED:]
+        stamps_ns = np.concatenate([self._stamps_ns, np.full(count, stamp_ns)])
+        self._stamps_ns = stamps_ns[-MOST_EMBEDDED:]
+        return rows
+
+
+def square_crop(rgb: UInt8, box_xyxy: Float64) -> UInt8:
+    """The square of an image (H, W, 3) around a box, as far as the image reaches."""
+    x1, y1, x2, y2 = box_xyxy.tolist()
+    half = 0.5 * (1.0 + CROP_MARGIN) * max(x2 - x1, y2 - y1, 1.0)
+    x, y = (x1 + x2) / 2, (y1 + y2) / 2
+    top, left = (max(math.floor(value - half), 0) for value in (y, x))
+    return rgb[top : math.ceil(y + half) + 1, left : math.ceil(x + half) + 1]
+
+
 # --- Stage a: one RGB-D frame → its 2D scene graph and its instance image.
 
 logger = logging.getLogger(__name__)
@@ -296,7 +350,8 @@ class Perceived:
         drops: number of dropped detections by reason: ``over_max_names``, ``box_too_small`` (or
             outside the image), ``box_is_the_view`` (fills the image), ``over_max_objects``,
             ``detected_twice`` (nested), ``segmenter_error`` (all of the frame).
-            ``relation_head_error`` counts the objects that are passed on without relations.
+            ``relation_head_error`` counts the objects that are passed on without relations,
+            and ``embedder_error`` without embeddings.
         failures: error message of each backend that failed on this frame, by reason.
         turns: quarter turns counter-clockwise after which perception saw the image.
     """
@@ -317,6 +372,7 @@ class Perception:
         detector, segmenter, relation_head: the backends.
         config: the section `perception`.
         world_up: axis of the world frame that points up: auto, z, y or -y (`UpEstimator`).
+        embedder: embeds some objects of each frame, in place of the detector's own embeddings.
         detectors: frames that `detect` can take at the same time, in other threads than that of
             `perceive`; 0 = it runs in the thread of `perceive` alone.
 
@@ -334,11 +390,14 @@ class Perception:
         *,
         world_up: str = "auto",
         detectors: int = 0,
+        embedder: Embedder | None = None,
     ) -> None:
         self.detectors = detectors
+        self._embedder, self._queue = embedder, EmbeddingQueue()
         self._detector = detector
         self._segmenter = segmenter
         self._relation_head = relation_head
+        self._words = config.words
         self._refine = config.refine_detections
         self._up = UpEstimator(world_up)
         # Another process has seen the image as it is.
@@ -350,8 +409,31 @@ class Perception:
         self.vocabulary = _vocabulary(detector.classes, relation_head.predicates)
         self.configure(config)
 
+    def check(self, config: PerceptionConfig) -> None:
+        """Raise ConfigurationError for words that the detector cannot look for."""
+        if hasattr(self._detector, "check_words"):
+            self._detector.check_words(config.words)
+        elif config.words:
+            raise ConfigurationError(
+                f"perception.words needs a detector of free text, and perception.detector is "
+                f"'{config.detector}': set it to open_vocabulary, with a perception.detector_path"
+            )
+
+    def take_over(self, other: Perception, config: PerceptionConfig) -> None:
+        """Keep the columns of another perception's classes, which this one replaces."""
+        if hasattr(self._detector, "use_words"):
+            self._detector.use_words(config.words, other.vocabulary.classes)
+
     def configure(self, config: PerceptionConfig) -> None:
-        """Use another `score_threshold` and `max_relations` from the next frame on."""
+        """Use other `score_threshold`, `max_relations` and `words` from the next frame on.
+
+        Raises:
+            ConfigurationError: as `check`; nothing changes.
+        """
+        self.check(config)
+        if config.words != self._words:
+            self._detector.use_words(config.words)  # type: ignore[attr-defined]
+            self._words = config.words
         self._max_relations = config.max_relations
         self.score_threshold = (
             self._detector.default_score_threshold
@@ -364,6 +446,8 @@ class Perception:
         self._detector = wrap("detector", self._detector)
         self._segmenter = wrap("segmenter", self._segmenter)
         self._relation_head = wrap("relation_head", self._relation_head)
+        if self._embedder is not None:
+            self._embedder = wrap("embedder", self._embedder)
 
     def turn_upright(self, frame: RgbdFrame) -> UprightFrame:
         """The next frame, upright; as it is if detections are not refined."""
@@ -431,6 +515,9 @@ class Perception:
                 drops["relation_head_error"] = len(objects)
             else:
                 relations = related
+        embeddings = self._embeddings(frame, objects)
+        if "embedder_error" in self._failures:
+            drops["embedder_error"] = len(objects)
         frame_graph = FrameGraph(
             stamp_ns=frame.stamp_ns,
             frame_id=frame.frame_id,
@@ -441,8 +528,27 @@ class Perception:
             class_probabilities=objects.class_probabilities,
             scores=objects.scores,
             relations=relations,
+            colours_lab=mean_colours(frame.rgb, instances, [mask.window for mask in masks]),
+            embeddings=embeddings,
         )
         return Perceived(frame_graph, instances, dict(drops), self._failures)
+
+    def _embeddings(self, frame: RgbdFrame, objects: Detections) -> Embeddings | None:
+        """Those of the embedder or the detector; None if there are none, or the embedder failed."""
+        rows, vectors, model = np.arange(len(objects)), objects.embeddings, objects.embedding_model
+        if self._embedder is not None:
+            rows = np.array(self._queue.choose(objects.boxes_xyxy, frame.stamp_ns), np.int64)
+            crops = [square_crop(frame.rgb, objects.boxes_xyxy[row]) for row in rows]
+            try:
+                vectors = self._embedder.embed(crops) if crops else None
+            except Exception as error:  # see detect
+                self._note_failure("embedder", "embedder_error", error)
+                return None
+            model = self._embedder.model_name
+        if vectors is None:
+            return None
+        found = unit_embeddings(vectors, rows, model)
+        return found if len(found.rows) else None
 
     def detect(self, frame: RgbdFrame) -> Detections:
         """Objects and, if refined, weak boxes of an upright frame; raises ``detector_error``."""
@@ -460,9 +566,9 @@ class Perception:
     def segment(
         self, frame: RgbdFrame, objects: Detections, weak: Detections
     ) -> list[MaskPatch] | None:
-        """A mask of each object, without the pixels of `weak`; None if the segmenter failed.
+        """A mask of each object: the detector's, or the segmenter's without the pixels of `weak`.
 
-        Masks that the objects bring are taken as they are.
+        None if the segmenter failed.
         """
         if objects.masks is not None:
             return list(objects.masks)

@@ -23,9 +23,18 @@ from deworldsg_ros.relations.paper import (
     neighbour_pairs,
     visual_distribution,
 )
-from deworldsg_ros.relations.registry import WORLD_MODELS, build_world_model
-from deworldsg_ros.relations.stage import EvidenceWorker, RelationCounters, RelationReasoner
-from deworldsg_ros.relations.world_model import ClipRequest, PairContext, WorldModel
+from deworldsg_ros.relations.stage import (
+    WORLD_MODELS,
+    EvidenceWorker,
+    RelationCounters,
+    RelationReasoner,
+    build_world_model,
+)
+from deworldsg_ros.relations.world_model import (
+    ClipRequest,
+    PairContext,
+    WorldModel,
+)
 
 __all__ = [
     "WORLD_MODELS",

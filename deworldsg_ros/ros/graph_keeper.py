@@ -14,6 +14,7 @@ from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.base.files import write_atomically
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.config import Config
+from deworldsg_ros.graph.embeddings import embeddings_path, write_embeddings
 from deworldsg_ros.graph.provenance import path_beside, space_path, write_seen, write_space
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.map_file import (
@@ -25,7 +26,7 @@ from deworldsg_ros.map_file import (
     write_map,
     write_state,
 )
-from deworldsg_ros.ros.graph_output import MakeMarkers, WholeGraph
+from deworldsg_ros.ros.graph_output import EmbeddingTopic, MakeMarkers, WholeGraph
 from deworldsg_ros.ros.health import HIDDEN
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.options import Parameters
@@ -148,7 +149,11 @@ class GraphFiles:
 
     def _check_paths(self, map_path: Path) -> None:
         path = self._save_path
-        beside = [("its frames", path_beside(path)), ("its space", space_path(path))]
+        beside = [
+            ("its frames", path_beside(path)),
+            ("its space", space_path(path)),
+            ("its embeddings", embeddings_path(path)),
+        ]
         check_paths(map_path, [("save_path", path), *beside])
 
     def continued_map(self) -> Continued | None:
@@ -174,6 +179,7 @@ class GraphFiles:
             stamp_ns = wire.ns_from_stamp(message.stamp)
             write_seen(self._save_path, stamp_ns, builder.frames.all(builder.graph))
             write_space(self._save_path, builder.space)
+            write_embeddings(self._save_path, stamp_ns, builder.graph.embeddings)
         except OSError as error:
             return False, f"{self._save_path}: {error}"
         nodes, edges = counted(len(message.nodes), "node"), counted(len(message.edges), "edge")
@@ -305,6 +311,7 @@ class GraphKeeper:
         self._running_s = 0.0  # when the job that runs now was submitted
         self._publish_update = node.json_publisher("scene_graph/updates", 50)
         self._whole = WholeGraph(node, markers)
+        self._embeddings = EmbeddingTopic(node)
         self.files = GraphFiles(node)
         # None until a map or the first local graph gives the world frame and the vocabulary.
         continued = self.files.continued_map()
@@ -392,6 +399,8 @@ class GraphKeeper:
         if self._builder is None:
             self._builder = GraphBuilder(self._node.parameters, local.vocabulary, local.frame_id)
         self._builder.integrate(local)
+        for reason, message in self._builder.refused.items():
+            self._node.drop(reason, message)
         if local.stamp_ns < self.newest_ns:
             self._node.drop("time_jump", jump_text("local graph", self.newest_ns))
             lost = self._pending.clear()
@@ -432,7 +441,9 @@ class GraphKeeper:
             with self._node.refusing():
                 self.files.checkpoint(self._builder)
         now_s = time.monotonic()
-        parts = (self._times, self._whole, self.files)
+        with self._node.refusing():
+            self._embeddings.publish(self._builder, self._session, now_s)
+        parts = (self._times, self._whole, self.files, self._embeddings)
         waits = (part.wait_s(now_s) for part in parts)
         return min((wait_s for wait_s in waits if wait_s is not None), default=None)
 

@@ -12,8 +12,11 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
+from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
+from deworldsg_ros.graph.embeddings import embeddings_message
+from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.threads import Worker
@@ -153,6 +156,48 @@ def _six_by_six(covariance_m2: list[float]) -> list[float]:
     """(36,) row by row: position first; the orientation has no covariance."""
     rows = [covariance_m2[3 * row : 3 * row + 3] + [0.0] * 3 for row in range(3)]
     return [float(value) for row in [*rows, *([[0.0] * 6] * 3)] for value in row]
+
+
+# --- The embeddings of the nodes, for those who want them.
+
+EMBEDDINGS_TOPIC = "deworldsg/embeddings"
+EMBEDDINGS_PERIOD_S = 1.0
+
+
+class EmbeddingTopic:
+    """Publishes embeddings of a graph that have changed, once a second, while somebody listens.
+
+    A new subscriber gets all of them.
+    """
+
+    def __init__(self, node: StageNode) -> None:
+        self._publisher = node.create_publisher(String, EMBEDDINGS_TOPIC, reliable(1, latched=True))
+        self._listeners, self._session = 0, ""
+        self._is_needed, self._due_s = False, 0.0
+
+    def wait_s(self, now_s: float) -> float | None:
+        """Seconds until `publish` looks again, 0 = now; None for a graph without embeddings."""
+        return max(0.0, self._due_s - now_s) if self._is_needed else None
+
+    def publish(self, builder: GraphBuilder | None, session: str, now_s: float) -> None:
+        """Publish what is due."""
+        self._is_needed = builder is not None and bool(builder.graph.embeddings.model)
+        if builder is None or not self._is_needed or now_s < self._due_s:
+            return
+        self._due_s = now_s + EMBEDDINGS_PERIOD_S
+        listeners = self._publisher.get_subscription_count()
+        whole = listeners > self._listeners or session != self._session
+        self._listeners = listeners
+        graph = builder.graph
+        if not listeners:
+            graph.embeddings.changed.clear()  # the next subscriber gets all
+            return
+        self._session = session
+        message = embeddings_message(graph.embeddings, whole, builder.newest_ns, graph.frame_id)
+        if message is not None:
+            message.session = session
+            self._publisher.publish(String(data=wire.encode(message)))
+            self._due_s += (time.monotonic() - now_s) / MAX_SHARE
 
 
 # --- The whole graph on /scene_graph and as markers, slowly and in the background.

@@ -243,11 +243,15 @@ REASONS: dict[str, str] = {
     "relation_head_error": "The relation head failed on an image. Its frame graph has no "
     "relations. Read the traceback in the log; if memory is short, choose a smaller checkpoint or "
     "another device.",
+    "embedder_error": "The embedder failed on an image. Its objects get no embeddings. Read the "
+    "traceback in the log; if memory is short, choose a smaller checkpoint or another device.",
     "world_model_error": "The world model failed on a clip. The clip gives no prediction. Read the "
     "message in the log; if memory is short, choose another device.",
     "nan_features": "The world model computed NaN or infinity for a clip. The clip gives no "
     "prediction. Run it on the CPU (`perception.device: cpu`), and report it with "
     "`deworldsg models inspect`.",
+    "embedding_model_mismatch": "A frame has embeddings of another model than the graph. It is "
+    "merged without them. Use one model, or begin a new graph (the service `clear`).",
     # Files
     "map_not_written": "A checkpoint of the map could not be written; the file holds the one "
     "before. Make room on the disk, or take another `map_path`.",

@@ -19,8 +19,7 @@ from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.relations.clips import PublishedGraph
-from deworldsg_ros.relations.registry import build_world_model
-from deworldsg_ros.relations.stage import EvidenceWorker, RelationReasoner
+from deworldsg_ros.relations.stage import EvidenceWorker, RelationReasoner, build_world_model
 from deworldsg_ros.relations.world_model import require_predicates
 from deworldsg_ros.ros.inputs import (
     WANTED_DEPTH,
@@ -43,7 +42,7 @@ from deworldsg_ros.wire import messages as wire
 # Every call of a model runs in a thread of its own and has a time limit. A model that fails again
 # and again is loaded again, on the CPU. Faults can be injected, to try what the robot does then.
 
-PARTS = ("detector", "segmenter", "relation_head", "world_model")
+PARTS = ("detector", "segmenter", "relation_head", "embedder", "world_model")
 # The slowest step of perception, a large network on a CPU, takes seconds.
 PERCEPTION_LIMIT_S = 30.0
 # A clip of the largest world model takes a minute on a CPU.
@@ -58,7 +57,7 @@ HUNG_LIMITS = 2
 # /diagnostics warns about a call that takes longer.
 SLOW_S = 5.0
 # Methods whose result a stage waits for.
-CALLS = ("detect", "segment", "relate", "predict")
+CALLS = ("detect", "segment", "relate", "predict", "embed")
 
 
 class ModelError(Exception):
@@ -181,7 +180,11 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         options: arguments of rclpy's Node.
     """
 
-    LIVE: tuple[str, ...] = ("perception.score_threshold", "perception.max_relations")
+    LIVE: tuple[str, ...] = (
+        "perception.score_threshold",
+        "perception.max_relations",
+        "perception.words",
+    )
 
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, product, max_busy_s=MAX_BUSY_S, **options)
@@ -213,6 +216,10 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         listen_depth(self, self.taking(frames.add_depth), self.wants_depth, WANTED_DEPTH)
         listen_rgb(self, self.taking(frames.add_rgb), self.wants_images, WANTED_DEPTH)
 
+    def check(self, parameters: Any) -> None:
+        """Refuse words that the detector cannot look for."""
+        self._perception.check(parameters.perception)
+
     def configure(self) -> None:
         """Take changed parameters."""
         self._perception.configure(self.parameters.perception)
@@ -231,6 +238,7 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         config = msgspec.structs.replace(self.parameters.perception, device="cpu")
         self.get_logger().warning("loading the models again, on the CPU")
         fresh = build_perception(config, world_up=self.parameters.inputs.world_up)
+        fresh.take_over(self._perception, config)
         fresh.watch(lambda part, backend: self._models[part].replace(backend))
 
     def perceive(self, frame: RgbdFrame) -> Perceived:

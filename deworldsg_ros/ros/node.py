@@ -285,6 +285,9 @@ class StageNode(Node):
         self.every(CHECK_PERIOD_S, self._check_publishers)
         self.every(DIAGNOSTICS_PERIOD_S, self.diagnose)
 
+    def check(self, parameters: Any) -> None:
+        """Raise ConfigurationError for parameters that cannot be taken; for subclasses."""
+
     def configure(self) -> None:
         """Take changed `parameters`, those of `LIVE`; for subclasses."""
 

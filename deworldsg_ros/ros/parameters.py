@@ -17,6 +17,7 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 
 from deworldsg_ros.base.words import suggestion
+from deworldsg_ros.config import texts_limits
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -24,6 +25,8 @@ from deworldsg_ros.scene.errors import ConfigurationError
 
 # Parameters that rclpy reads itself.
 CLIP_RATE = "relations.max_clips_per_s"
+# Characters of a value in an error.
+MAX_SHOWN = 500
 RCLPY_NAMES = ("use_sim_time", "start_type_description_service")
 
 P = TypeVar("P", bound=msgspec.Struct)
@@ -36,12 +39,13 @@ class Field:
     Attributes:
         name: ROS name: ``section.field``, or ``field`` for the section ``node``.
         path: section and field.
-        kind: float, int, str or bool.
+        kind: float, int, str, bool or list (of texts).
         default: value without an override.
         description: one line for the user.
         lowest, highest: bounds; None = unbounded.
         lowest_is_open, highest_is_open: whether the bound itself is refused.
         choices: allowed strings; empty = any.
+        texts: limits of a list of texts, in words.
     """
 
     name: str
@@ -54,9 +58,12 @@ class Field:
     lowest_is_open: bool = False
     highest_is_open: bool = False
     choices: tuple[str, ...] = ()
+    texts: str = ""
 
     def limits(self) -> str:
         """Allowed values, in words; empty = any."""
+        if self.texts:
+            return self.texts
         if self.choices:
             return "one of " + ", ".join(self.choices)
         parts = []
@@ -115,8 +122,7 @@ def resolve(overrides: dict[str, Any], source: str, kind: type[P]) -> P:
             hint = suggestion(name, known)
             raise ConfigurationError(f"{source}: there is no parameter {name}{hint}")
         section, key = field.path
-        _check(field, value, kind, source)
-        content.setdefault(section, {})[key] = value
+        content.setdefault(section, {})[key] = _checked(field, value, kind, source)
     return msgspec.convert(content, kind)
 
 
@@ -130,8 +136,7 @@ def changed(parameters: P, values: dict[str, Any], source: str) -> P:
     for field in fields(type(parameters)):
         if field.name not in values:
             continue
-        value = values[field.name]
-        _check(field, value, type(parameters), source)
+        value = _checked(field, values[field.name], type(parameters), source)
         section, key = field.path
         before = getattr(parameters, section)
         if field.name == CLIP_RATE and bool(value) != bool(getattr(before, key)):
@@ -144,10 +149,13 @@ def changed(parameters: P, values: dict[str, Any], source: str) -> P:
     return parameters
 
 
-def _check(field: Field, value: Any, kind: type[msgspec.Struct], source: str) -> None:
+def _checked(field: Field, value: Any, kind: type[msgspec.Struct], source: str) -> Any:
     section, key = field.path
+    if field.kind is list and value is None:
+        value = []  # in a parameter file, an empty list has no type
     try:
-        msgspec.convert({section: {key: value}}, kind)
+        converted = msgspec.convert({section: {key: value}}, kind)
+        return getattr(getattr(converted, section), key)
     except msgspec.ValidationError as error:
         raise ConfigurationError(f"{source}: {_complaint(field, value)}") from error
 
@@ -160,7 +168,11 @@ def fields(kind: type[msgspec.Struct] = Parameters) -> list[Field]:
 def descriptor(field: Field, *, read_only: bool = True) -> ParameterDescriptor:
     """ROS description of a parameter."""
     result = ParameterDescriptor(
-        description=field.description, read_only=read_only, additional_constraints=field.limits()
+        description=field.description,
+        read_only=read_only,
+        additional_constraints=field.limits(),
+        # rclpy takes an empty list for one of bytes.
+        dynamic_typing=field.kind is list,
     )
     bounded = field.lowest is not None or field.highest is not None
     if field.kind is float and bounded:
@@ -207,6 +219,8 @@ def _field(name: str, path: tuple[str, str], kind: Any, default: Any, descriptio
             lowest_is_open=kind.gt is not None,
             highest_is_open=kind.lt is not None,
         )
+    if isinstance(kind, inspect.VarTupleType):
+        return Field(name, path, list, list(default), description, texts=texts_limits(kind))
     return Field(
         name, path, bool if isinstance(kind, inspect.BoolType) else str, default, description
     )
@@ -219,7 +233,8 @@ def _complaint(field: Field, value: Any) -> str:
     hint = ""
     if field.kind is str and isinstance(value, bool):
         hint = " (YAML reads a bare y, n, on or off as a boolean: put it in quotes)"
-    return f"parameter {field.name} is {value!r}, expected {expected}{hint}: {field.description}"
+    shown = repr(value) if len(repr(value)) <= MAX_SHOWN else f"{repr(value)[:MAX_SHOWN]}…"
+    return f"parameter {field.name} is {shown}, expected {expected}{hint}: {field.description}"
 
 
 # --- Parameters that change while a node runs.
@@ -244,7 +259,9 @@ class LiveParameters:
 
     def _check(self, parameters: list[Any]) -> SetParametersResult:
         try:
-            self._changed(parameters)
+            found = self._changed(parameters)
+            if found != self._node.parameters:
+                self._node.check(found)
         except ConfigurationError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
+Float16 = NDArray[np.float16]
 Int64 = NDArray[np.int64]
 Int32 = NDArray[np.int32]
 Int16 = NDArray[np.int16]
@@ -53,6 +54,12 @@ def softmax(logits: Float64) -> Float64:
 
 
 # --- Axis-aligned boxes in an image: x1, y1, x2, y2.
+
+
+def corners_of(boxes_cxcywh: Float64) -> Float64:
+    """Corners (n, 4) of boxes (n, 4) given by centre, width and height."""
+    centres, halves = boxes_cxcywh[:, :2], boxes_cxcywh[:, 2:] / 2
+    return np.hstack([centres - halves, centres + halves])
 
 
 def areas(boxes: Float64) -> Float64:

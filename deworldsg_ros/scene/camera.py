@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -447,3 +447,70 @@ class UpEstimator:
         lean = 0.02 * self._count * np.outer(mean_up, mean_up)
         up = np.linalg.eigh(self._rows - lean)[1][:, 0]
         return np.asarray(up if up @ mean_up >= 0 else -up)
+
+
+# --- Frames of a camera that is mounted on its side, turned upright.
+#
+# A quarter turn moves pixels and does not change them: the pixel (u, v) of an image of width W
+# becomes (v, W - 1 - u).
+
+# R_camera_turned of one quarter turn: the new x axis is y, the new y axis is -x.
+QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class UprightFrame:
+    """A frame, and the same frame turned upright.
+
+    Attributes:
+        original: as the camera took it.
+        upright: the same object if it needs no turn.
+        turns: quarter turns counter-clockwise from `original` to `upright`, 0 to 3.
+    """
+
+    original: RgbdFrame
+    upright: RgbdFrame
+    turns: int = 0
+
+
+class Uprighter:
+    """Decides for each frame, in order of time, how it is turned.
+
+    The turn changes only when up is clearly in the direction of another side of the image. A camera
+    that looks straight down keeps its turn.
+
+    Args:
+        world_up: as `UpEstimator`.
+    """
+
+    def __init__(self, world_up: str) -> None:
+        self._up = UpEstimator(world_up)
+        self._turns = 0
+
+    def turn(self, frame: RgbdFrame) -> UprightFrame:
+        """The frame, upright."""
+        self._up.observe(frame.T_world_camera)
+        turns = quarter_turns(frame.T_world_camera[:3, :3].T @ self._up.up_world())
+        self._turns = self._turns if turns is None else turns
+        return UprightFrame(frame, turned(frame, self._turns), self._turns)
+
+
+def turned(frame: RgbdFrame, turns: int) -> RgbdFrame:
+    """A frame after so many quarter turns counter-clockwise; its pose is that of the turned camera.
+
+    The same object for no turn.
+    """
+    if turns % 4 == 0:
+        return frame
+    intrinsics, T_world_camera = frame.intrinsics, frame.T_world_camera.copy()
+    for _ in range(turns % 4):
+        i = intrinsics
+        intrinsics = Intrinsics(i.fy, i.fx, i.cy, i.width - 1 - i.cx, i.height, i.width)
+        T_world_camera[:3, :3] = T_world_camera[:3, :3] @ QUARTER_TURN
+    return replace(
+        frame,
+        rgb=np.ascontiguousarray(np.rot90(frame.rgb, turns)),
+        depth_m=np.ascontiguousarray(np.rot90(frame.depth_m, turns)),
+        intrinsics=intrinsics,
+        T_world_camera=T_world_camera,
+    )

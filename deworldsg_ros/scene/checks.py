@@ -103,6 +103,17 @@ def check_counts(name: str, counts: Int64, count: int) -> None:
         raise ValueError(f"{name} contain {counts.min()}: expected >= 1")
 
 
+def check_colours(colours_lab: Float32 | None, count: int) -> None:
+    """Check CIELAB colours (n, 3), if there are any: inside the range, or a row of NaN."""
+    if colours_lab is None:
+        return
+    check_shape("colours", colours_lab, (count, 3))
+    known = colours_lab[~np.isnan(colours_lab).all(axis=1)]
+    check_array("colours", known, known.shape, limits.MAX_LAB)
+    if known.size and known[:, 0].min() < 0.0:
+        raise ValueError(f"a colour has the lightness {known[:, 0].min():.6g}: expected >= 0")
+
+
 def check_depths(depths_m: Float64, count: int) -> None:
     """Check depths (n,): in front of the camera."""
     check_array("depths", depths_m, (count,), limits.MAX_COORDINATE_M)

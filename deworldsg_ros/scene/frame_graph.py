@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from deworldsg_ros.scene import checks, limits
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
+from deworldsg_ros.scene.arrays import Bool, Float16, Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
 
@@ -49,6 +49,47 @@ class Relations:
 
 
 @dataclass(frozen=True)
+class Embeddings:
+    """What the image shows of some objects of a frame, as vectors of a model.
+
+    Attributes:
+        rows: (m,) int64, the objects, ascending.
+        vectors: (m, D) float16, of length one.
+        model: name of the model.
+    """
+
+    rows: Int64
+    vectors: Float16
+    model: str
+
+    def __post_init__(self) -> None:
+        size = self.vectors.shape[-1]
+        checks.check_shape("embeddings", self.vectors, (len(self.rows), size))
+        if not 1 <= size <= limits.MAX_EMBEDDING:
+            raise ValueError(f"embeddings of {size} values: expected 1 to {limits.MAX_EMBEDDING}")
+        lengths = np.linalg.norm(self.vectors.astype(np.float32), axis=1)
+        if not (np.abs(lengths - 1.0) < 0.01).all():
+            raise ValueError("an embedding is not of length 1")
+        if not self.model:
+            raise ValueError("embeddings without the name of their model")
+        limits.check_names([self.model])
+
+    def check_rows(self, count: int) -> None:
+        """Raise ValueError unless the rows are of `count` objects, each once."""
+        if len(self.rows) and not (
+            self.rows[0] >= 0 and (np.diff(self.rows) > 0).all() and self.rows[-1] < count
+        ):
+            raise ValueError(f"embeddings of the rows {self.rows.tolist()} of {count} objects")
+
+    def take(self, rows: Int64) -> Embeddings | None:
+        """Those of the objects of `rows`, ascending, renumbered; None if there are none."""
+        kept = np.isin(self.rows, rows)
+        if not kept.any():
+            return None
+        return Embeddings(np.searchsorted(rows, self.rows[kept]), self.vectors[kept], self.model)
+
+
+@dataclass(frozen=True)
 class FrameGraph:
     """The 2D scene graph of one frame (n objects, C classes), best score first.
 
@@ -61,6 +102,9 @@ class FrameGraph:
         class_probabilities: (n, C) float64, calibrated, rows sum to one.
         scores: (n,) float64, the detector's own score.
         relations: visual relations between rows.
+        colours_lab: (n, 3) float32, mean colour of each object, CIELAB; a row of NaN, or None = not
+            known.
+        embeddings: what the image shows of some of the objects; None = of none.
 
     The k-th object (from 0) has the value k + 1 in the frame's instance image, (H, W) uint16.
     """
@@ -74,10 +118,15 @@ class FrameGraph:
     class_probabilities: Float64
     scores: Float64
     relations: Relations
+    colours_lab: Float32 | None = None
+    embeddings: Embeddings | None = None
 
     def __post_init__(self) -> None:
         count = len(self.boxes_xyxy)
+        if self.embeddings is not None:
+            self.embeddings.check_rows(count)
         checks.check_boxes(self.boxes_xyxy, count)
+        checks.check_colours(self.colours_lab, count)
         _check_objects(count, self.vocabulary, self.class_probabilities, self.scores)
         _check_relations(count, self.vocabulary, self.relations)
 
@@ -141,6 +190,7 @@ class LocalGraph:
         relations: visual relations between rows.
         drops: number of objects not lifted, by reason.
         depth_grid: depth and instances of the whole image; None = not available.
+        colours_lab, embeddings: as those of the frame graph.
     """
 
     stamp_ns: int
@@ -161,15 +211,20 @@ class LocalGraph:
     relations: Relations
     drops: dict[str, int] = field(default_factory=dict)
     depth_grid: DepthGrid | None = None
+    colours_lab: Float32 | None = None
+    embeddings: Embeddings | None = None
 
     def __post_init__(self) -> None:
         count = len(self.means_world)
+        if self.embeddings is not None:
+            self.embeddings.check_rows(count)
         try:
             check_pose(self.T_world_camera)
         except RefusedInput as refusal:
             raise ValueError(str(refusal)) from refusal
         checks.check_boxes(self.boxes_xyxy, count)
         checks.check_instance_ids(self.instance_ids, count)
+        checks.check_colours(self.colours_lab, count)
         checks.check_counts("pixel counts", self.pixel_counts, count)
         _check_objects(count, self.vocabulary, self.class_probabilities, self.scores)
         _check_relations(count, self.vocabulary, self.relations)
@@ -224,6 +279,8 @@ def lifted(
         class_probabilities=frame.class_probabilities[rows],
         scores=frame.scores[rows],
         relations=_between(frame.relations, rows, len(frame)),
+        colours_lab=None if frame.colours_lab is None else frame.colours_lab[rows],
+        embeddings=None if frame.embeddings is None else frame.embeddings.take(rows),
         **geometry,
     )
     local.check_geometry()

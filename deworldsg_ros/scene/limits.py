@@ -64,10 +64,12 @@ MIN_VARIANCE_RATIO = 1e-13
 MAX_LOGIT = 1e9
 # Geometric costs of pairs (Eq. 8): half a diagonal and a difference of depths, metres.
 MAX_COST = 1e6
-# Numbers of an embedding: the largest in use have 1536 (DINOv2 giant) and 1152 (SigLIP so400m).
-MAX_EMBEDDING = 4096
 # Bytes of a mask in a message, a bit a pixel: those of an image of 4K.
 MAX_MASK_BYTES = 2**20
+# Values of a CIELAB colour. Those of sRGB are up to 108.
+MAX_LAB = 128.0
+# Values of an embedding. Those of CLIP and SigLIP have 512 to 1536.
+MAX_EMBEDDING = 2048
 # Length of a label or frame_id, characters.
 MAX_NAME_CHARACTERS = 256
 # Size of a message of one frame: 256 objects with 800 points each need 12 MB.

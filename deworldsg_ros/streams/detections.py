@@ -96,7 +96,7 @@ def sent_detections(
             masks=_masks(items, width, height)
             if instances is None
             else _cut(instances, boxes, width, height),
-            embeddings=_embeddings(items),
+            embeddings=_embeddings(message),
             embedding_model=message.embedding_model,
         )
     except ValueError as error:
@@ -155,18 +155,23 @@ def _cut(instances: UInt16, boxes: Float64, width: int, height: int) -> tuple[Ma
     )
 
 
-def _embeddings(items: list[wire.SentDetection]) -> Float32 | None:
-    """Embeddings (n, D) if every object has one; None if none has."""
-    lengths = {len(item.embedding) for item in items}
-    if lengths <= {0}:
+def _embeddings(message: wire.DetectionsMessage) -> Float32 | None:
+    """Embeddings (n, D), zeros for objects without one; None if none has one."""
+    given = [item.embedding for item in message.detections]
+    size = max(map(len, given), default=0)
+    if not size:
         return None
-    if len(lengths) > 1 or lengths.pop() % 2:
+    if not message.embedding_model:
+        raise ValueError("embeddings without embedding_model: expected the name of their model")
+    wrong = [len(one) for one in given if len(one) not in (0, size)]
+    if wrong or size % 2:
         raise ValueError(
-            f"embeddings have {sorted({len(item.embedding) for item in items})} bytes: expected "
-            "as many for each object, two a number"
+            f"embeddings have {size} and {(wrong or [size])[0]} bytes: expected as many for each "
+            "object, two a number, or none"
         )
-    values: NDArray[Any] = np.frombuffer(b"".join(item.embedding for item in items), "<f2")
-    values = values.reshape(len(items), -1).astype(np.float32)
+    none = bytes(size)
+    values: NDArray[Any] = np.frombuffer(b"".join(one or none for one in given), "<f2")
+    values = values.reshape(len(given), -1).astype(np.float32)
     if not np.isfinite(values).all():
         raise ValueError("embeddings contain values that are not finite")
     return values

@@ -98,6 +98,7 @@ def _node(item: SceneObject, colour: str, axes_of_view: Float64) -> dict[str, An
         "id": item.id,
         "label": item.label,
         "colour": colour,
+        "looks": item.colour,
         "classes": [[belief.label, round(belief.probability, 3)] for belief in item.classes],
         "other": round(item.other_classes, 3),
         "existence": None if item.existence is None else round(item.existence, 3),

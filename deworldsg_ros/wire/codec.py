@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
-import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 
-from deworldsg_ros.scene.arrays import Float32, Float64, UInt16
+from deworldsg_ros.scene.arrays import Float16, Float32, Float64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
     DepthGrid,
+    Embeddings,
     FrameGraph,
     LocalGraph,
     RelationEvidence,
@@ -69,6 +71,49 @@ def _rows(rows: list[list[float]], width: int, name: str) -> Float64:
     return np.array(rows, np.float64).reshape(len(rows), width)
 
 
+def _colours_to_wire(colours_lab: Float32 | None, count: int) -> list[list[float] | UnsetType]:
+    if colours_lab is None:
+        return [UNSET] * count
+    return [row if row[0] == row[0] else UNSET for row in colours_lab.tolist()]  # NaN differs
+
+
+def _colours_from_wire(items: Sequence[wire.DetectedObject | wire.LiftedObject]) -> Float32 | None:
+    """Colours (n, 3), a row of NaN where there is none; None if no object has one."""
+    if all(item.colour_lab is UNSET for item in items):
+        return None
+    nothing = [float("nan")] * 3
+    rows = [nothing if item.colour_lab is UNSET else item.colour_lab for item in items]
+    return np.array(rows, np.float32)
+
+
+def _embeddings_to_wire(embeddings: Embeddings | None, count: int) -> list[bytes | UnsetType]:
+    found: list[bytes | UnsetType] = [UNSET] * count
+    if embeddings is not None:
+        for row, vector in zip(embeddings.rows.tolist(), embeddings.vectors):
+            found[row] = vector.astype("<f2").tobytes()
+    return found
+
+
+def _embeddings_from_wire(
+    items: Sequence[wire.DetectedObject | wire.LiftedObject], model: str | UnsetType
+) -> Embeddings | None:
+    known = [(row, item.embedding) for row, item in enumerate(items) if item.embedding is not UNSET]
+    if not known:
+        return None
+    rows = np.array([row for row, _ in known], np.int64)
+    vectors = vectors_from_bytes([content for _, content in known])
+    return Embeddings(rows, vectors, "" if model is UNSET else model)
+
+
+def vectors_from_bytes(contents: Sequence[bytes]) -> Float16:
+    """Vectors (n, D) of one length; ValueError if their lengths differ."""
+    sizes = sorted({len(content) for content in contents})
+    if len(sizes) > 1 or sizes[0] % 2:
+        raise ValueError(f"embeddings of {sizes} bytes: expected one even number")
+    flat = np.frombuffer(b"".join(contents), "<f2")
+    return flat.reshape(len(contents), -1).astype(np.float16)
+
+
 @lru_cache(maxsize=4)
 def _vocabulary(classes: tuple[str, ...], predicates: tuple[str, ...]) -> Vocabulary:
     """The vocabulary, checked once: every message of a session repeats it."""
@@ -79,6 +124,8 @@ def _vocabulary(classes: tuple[str, ...], predicates: tuple[str, ...]) -> Vocabu
 
 def frame_graph_to_message(graph: FrameGraph) -> wire.FrameGraphMessage:
     """The message of a 2D scene graph."""
+    colours = _colours_to_wire(graph.colours_lab, len(graph))
+    embeddings = _embeddings_to_wire(graph.embeddings, len(graph))
     return wire.FrameGraphMessage(
         schema=wire.schema_of(wire.FrameGraphMessage),
         stamp=wire.stamp_from_ns(graph.stamp_ns),
@@ -92,10 +139,13 @@ def frame_graph_to_message(graph: FrameGraph) -> wire.FrameGraphMessage:
                 graph.boxes_xyxy[row].tolist(),
                 float(graph.scores[row]),
                 graph.class_probabilities[row].tolist(),
+                colours[row],
+                embeddings[row],
             )
             for row in range(len(graph))
         ],
         relations=_relations_to_wire(graph.relations),
+        embedding_model=UNSET if graph.embeddings is None else graph.embeddings.model,
     )
 
 
@@ -117,6 +167,8 @@ def frame_graph_from_message(message: wire.FrameGraphMessage) -> FrameGraph:
             ),
             scores=np.array([item.score for item in objects], np.float64),
             relations=_relations_from_wire(message.relations, len(message.predicates)),
+            colours_lab=_colours_from_wire(objects),
+            embeddings=_embeddings_from_wire(objects, message.embedding_model),
         )
     except ValueError as error:
         raise RefusedInput("invalid_message", f"frame graph: {error}") from error
@@ -124,6 +176,8 @@ def frame_graph_from_message(message: wire.FrameGraphMessage) -> FrameGraph:
 
 def local_graph_to_message(graph: LocalGraph) -> wire.LocalGraphMessage:
     """The message of a local 3D graph."""
+    colours = _colours_to_wire(graph.colours_lab, len(graph))
+    embeddings = _embeddings_to_wire(graph.embeddings, len(graph))
     return wire.LocalGraphMessage(
         schema=wire.schema_of(wire.LocalGraphMessage),
         stamp=wire.stamp_from_ns(graph.stamp_ns),
@@ -144,12 +198,15 @@ def local_graph_to_message(graph: LocalGraph) -> wire.LocalGraphMessage:
                 depth_m=float(graph.depths_m[row]),
                 pixel_count=int(graph.pixel_counts[row]),
                 surface=graph.surface_points_world[row].astype("<f4").tobytes(),
+                colour_lab=colours[row],
+                embedding=embeddings[row],
             )
             for row in range(len(graph))
         ],
         relations=_relations_to_wire(graph.relations),
         drops=dict(graph.drops),
         depth_grid=_depth_grid_to_wire(graph.depth_grid),
+        embedding_model=UNSET if graph.embeddings is None else graph.embeddings.model,
     )
 
 
@@ -182,6 +239,8 @@ def local_graph_from_message(message: wire.LocalGraphMessage) -> LocalGraph:
             relations=_relations_from_wire(message.relations, len(message.predicates)),
             drops=message.drops,
             depth_grid=_depth_grid_from_wire(message),
+            colours_lab=_colours_from_wire(objects),
+            embeddings=_embeddings_from_wire(objects, message.embedding_model),
         )
     except ValueError as error:
         raise RefusedInput("invalid_message", f"local graph: {error}") from error
@@ -189,12 +248,12 @@ def local_graph_from_message(message: wire.LocalGraphMessage) -> LocalGraph:
 
 def _surface(item: wire.LiftedObject, schema: wire.Schema) -> Float32:
     """The surface points (k, 3) of an object in a message of any version."""
-    if (item.surface_points_m is msgspec.UNSET) != (schema.version > 1):
+    if (item.surface_points_m is UNSET) != (schema.version > 1):
         raise ValueError(
             f"object {item.instance} of version {schema.version}: version 1 has surface_points_m, "
             "and later ones have surface"
         )
-    if item.surface_points_m is msgspec.UNSET:
+    if item.surface_points_m is UNSET:
         return np.frombuffer(item.surface, "<f4").reshape(-1, 3).astype(np.float32)
     return np.array(item.surface_points_m, np.float32).reshape(-1, 3)
 

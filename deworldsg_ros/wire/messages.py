@@ -23,6 +23,7 @@ from deworldsg_ros.scene.limits import (
     MAX_GRAPH_VARIANCE_M2,
     MAX_INSTANCE,
     MAX_INT,
+    MAX_LAB,
     MAX_LOGIT,
     MAX_MASK_BYTES,
     MAX_NAME_CHARACTERS,
@@ -84,6 +85,34 @@ Logits = Annotated[
 Name = Annotated[
     str,
     msgspec.Meta(max_length=MAX_NAME_CHARACTERS, description="without control characters"),
+]
+Colour = Annotated[
+    Union[
+        Annotated[
+            list[Annotated[float, msgspec.Meta(ge=-MAX_LAB, le=MAX_LAB)]],
+            msgspec.Meta(min_length=3, max_length=3),
+        ],
+        msgspec.UnsetType,
+    ],
+    msgspec.Meta(
+        description="mean colour of the surface, CIELAB (D65): L* a* b*; absent = unknown"
+    ),
+]
+# Values of half precision take two bytes.
+Vector16 = Annotated[
+    bytes,
+    msgspec.Meta(
+        max_length=2 * MAX_EMBEDDING,
+        description="vector of length 1, float16 little-endian, base64",
+    ),
+]
+Embedding = Annotated[
+    Union[Vector16, msgspec.UnsetType],
+    msgspec.Meta(description="what the image shows of the object; absent = not embedded"),
+]
+Model = Annotated[
+    Union[Name, msgspec.UnsetType],
+    msgspec.Meta(description="that made the embeddings; absent = there are none"),
 ]
 # Of a scene graph, in metres.
 Vector3 = Annotated[
@@ -158,6 +187,8 @@ class DetectedObject(msgspec.Struct):
     box_xyxy: Box
     score: Probability
     class_probabilities: Distribution
+    colour_lab: Colour = msgspec.UNSET
+    embedding: Embedding = msgspec.UNSET
 
 
 class NameScore(msgspec.Struct):
@@ -215,7 +246,7 @@ class SentDetection(msgspec.Struct):
         bytes,
         msgspec.Meta(
             max_length=2 * MAX_EMBEDDING,
-            description="float16 little-endian, base64, as long for all objects; empty = none",
+            description="float16 little-endian, base64, as long for all objects, or empty",
         ),
     ] = b""
 
@@ -241,6 +272,7 @@ class FrameGraphMessage(Message, kw_only=True):
     predicates: Names
     objects: Annotated[list[DetectedObject], msgspec.Meta(max_length=MAX_OBJECTS)]
     relations: Annotated[list[RelationLogits], msgspec.Meta(max_length=MAX_RELATIONS)]
+    embedding_model: Model = msgspec.UNSET
 
 
 class LiftedObject(msgspec.Struct):
@@ -270,6 +302,8 @@ class LiftedObject(msgspec.Struct):
             "base64; replaces surface_points_m",
         ),
     ] = b""
+    colour_lab: Colour = msgspec.UNSET
+    embedding: Embedding = msgspec.UNSET
 
 
 class DepthGridState(msgspec.Struct, frozen=True):
@@ -300,6 +334,7 @@ class LocalGraphMessage(Message, kw_only=True):
     relations: Annotated[list[RelationLogits], msgspec.Meta(max_length=MAX_RELATIONS)]
     drops: Annotated[dict[Name, NonNegative], msgspec.Meta(max_length=MAX_OBJECTS)] = {}
     depth_grid: Union[DepthGridState, None] = None
+    embedding_model: Model = msgspec.UNSET
 
 
 class PairEvidence(msgspec.Struct):
@@ -392,6 +427,7 @@ class NodeState(msgspec.Struct, frozen=True, gc=False):
         Union[Literal["operator"], msgspec.UnsetType],
         msgspec.Meta(description="operator = set by hand; absent = from the frames"),
     ] = msgspec.UNSET
+    colour_lab: Colour = msgspec.UNSET
 
 
 class HiddenNode(msgspec.Struct, frozen=True):
@@ -521,6 +557,27 @@ class SceneGraphUpdateMessage(Message, kw_only=True):
     up: Up = msgspec.UNSET
 
 
+class NodeEmbedding(msgspec.Struct, frozen=True, gc=False):
+    """What an object looks like, from all viewpoints."""
+
+    id: NodeId
+    vector: Vector16
+
+
+class EmbeddingsMessage(Message, kw_only=True):
+    """deworldsg/embeddings: embeddings of objects of the graph; frame_id is the world's.
+
+    The first message to a new subscriber is whole. Others have what has changed since the last one;
+    a lost one leaves older vectors.
+    """
+
+    session: Session = msgspec.UNSET
+    whole: Annotated[bool, msgspec.Meta(description="replaces all that came before")]
+    model: Name
+    nodes: list[NodeEmbedding]
+    removed: Annotated[list[NodeId], msgspec.Meta(description="objects that have none any more")]
+
+
 MESSAGES: dict[str, type[Message]] = {
     "detections": DetectionsMessage,
     "frame_graph": FrameGraphMessage,
@@ -528,6 +585,7 @@ MESSAGES: dict[str, type[Message]] = {
     "relation_evidence": RelationEvidenceMessage,
     "scene_graph": SceneGraphMessage,
     "scene_graph_updates": SceneGraphUpdateMessage,
+    "embeddings": EmbeddingsMessage,
 }
 
 M = TypeVar("M", bound=Message)
@@ -547,7 +605,7 @@ def encode(message: Message) -> str:
 
 def max_bytes(kind: type[Message]) -> int:
     """Size of the largest message of this type that is read."""
-    is_graph = kind in (SceneGraphMessage, SceneGraphUpdateMessage)
+    is_graph = kind in (SceneGraphMessage, SceneGraphUpdateMessage, EmbeddingsMessage)
     return MAX_GRAPH_BYTES if is_graph else MAX_FRAME_BYTES
 
 
@@ -583,6 +641,12 @@ def decode(text: Union[str, bytes], kind: type[M], most_bytes: Optional[int] = N
             f"expected {known.name} version {known.version} or older",
         )
     checked_frame_id(message.frame_id)
+    if isinstance(message, EmbeddingsMessage):
+        try:
+            check_labels([message.model])
+            _check_once("node", [node.id for node in message.nodes])
+        except ValueError as error:
+            raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
     if isinstance(message, (SceneGraphMessage, SceneGraphUpdateMessage)):
         try:
             _check_graph(message)

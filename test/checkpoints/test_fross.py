@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from deworldsg_ros.checkpoints.cards import read_detector_card
 from deworldsg_ros.checkpoints.fross import Names, import_checkpoint, infer_config
 from deworldsg_ros.cli.models import app
-from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector
+from deworldsg_ros.perception.backends.closed_set import ClosedSetDetector, EgtrRelationHead
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabulary import SCANNET_CLASSES, SCANNET_PREDICATES
 
@@ -204,7 +204,7 @@ def test_parameters_are_where_they_belong(imported):
 def test_an_imported_checkpoint_finds_objects_and_relations(imported):
     _, out, _ = imported
     config = settings(detector_path=str(out), predicate_set="3dssg")
-    detector = RtDetrDetector(config)
+    detector = ClosedSetDetector(config)
     head = EgtrRelationHead(config, detector)
     assert detector.classes == SCANNET_CLASSES and head.predicates == SCANNET_PREDICATES
     assert detector.default_score_threshold == 0.7

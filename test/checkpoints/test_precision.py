@@ -10,7 +10,7 @@ from support.torch_models import image, save_rtdetr, save_sam2, save_sam3, setti
 
 from deworldsg_ros.checkpoints.loading import in_best_precision
 from deworldsg_ros.perception.backends import sam
-from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
+from deworldsg_ros.perception.backends.closed_set import ClosedSetDetector
 from deworldsg_ros.perception.backends.sam import Sam2Segmenter, Sam3Segmenter
 from deworldsg_ros.relations import clip_models
 from deworldsg_ros.relations.clip_models import build_probed
@@ -103,7 +103,7 @@ def test_nan_in_features_is_counted_by_name(tmp_path, monkeypatch):
 
 
 def test_nan_of_a_detector_is_an_error_and_not_an_empty_image(tmp_path):
-    detector = RtDetrDetector(settings(detector_path=str(save_rtdetr(tmp_path))))
+    detector = ClosedSetDetector(settings(detector_path=str(save_rtdetr(tmp_path))))
     with torch.no_grad():
         for head in detector.model.model.decoder.class_embed:
             head.bias.fill_(float("nan"))

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from deworldsg_ros.checkpoints.catalogue import require_checkpoints
+from deworldsg_ros.checkpoints.catalogue import detector_of, require_checkpoints, unused_detector
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import Config, PerceptionConfig, load_config, to_mapping
 
@@ -48,6 +48,47 @@ def test_existing_folders_hub_ids_and_embedded_models_pass(root_dir, tmp_path):
     )
     with pytest.raises(Exception, match=r"RT-DETR \(perception.detector_path ''\)"):
         require_checkpoints(PerceptionConfig(detector="rtdetr"))
+
+
+def test_an_exported_detector_is_named_by_its_command():
+    with pytest.raises(Exception, match="models export NAME x/y/z`"):
+        require_checkpoints(PerceptionConfig(detector="onnx", detector_path="x/y/z"))
+
+
+def test_a_stronger_detector_that_lies_there_is_noticed(tmp_path):
+    def noticed(**changes):
+        return unused_detector(PerceptionConfig(**changes), tmp_path)
+
+    assert noticed() == unused_detector(PerceptionConfig(), tmp_path / "none") == ("", "")
+    for name, content in (
+        ("dfine-small-obj365", {"config.json": '{"model_type": "d_fine"}'}),  # without weights
+        ("sam-vit-base", {"config.json": '{"model_type": "sam"}', "model.safetensors": ""}),
+        ("zz_exported", {"model.onnx": "", "model.json": "{}"}),
+    ):
+        (tmp_path / name).mkdir()
+        for file, text in content.items():
+            (tmp_path / name / file).write_text(text)
+    exported = str(tmp_path / "zz_exported")
+    assert noticed() == (
+        exported,
+        f"--set perception.detector=onnx --set perception.detector_path={exported}",
+    )
+    (tmp_path / "dfine-small-obj365" / "model.safetensors").write_text("")
+    folder, settings = noticed()
+    assert folder == str(tmp_path / "dfine-small-obj365") and "=transformers " in settings
+    assert noticed(detector="transformers") == ("", "")
+    # Its configuration tells the backend of a folder.
+    (tmp_path / "sam-vit-base" / "config.json").write_text('{"model_type": "owlv2"}')
+    assert detector_of(tmp_path / "sam-vit-base") == "open_vocabulary"
+    (tmp_path / "sam-vit-base" / "config.json").write_text("[1]")
+    assert detector_of(tmp_path / "sam-vit-base") == detector_of(tmp_path) == "transformers"
+
+
+def test_a_detector_of_free_text_is_measured_with_words(root_dir, tmp_path):
+    (tmp_path / "config.json").write_text('{"model_type": "grounding-dino"}')
+    command = ["models", "measure", str(tmp_path), str(root_dir / "bags" / "demo_room")]
+    refused = CliRunner().invoke(app, command)
+    assert refused.exit_code == 2 and "give --words 'mug, drill'" in refused.output
 
 
 def test_the_files_of_the_paper_differ_only_where_they_have_to(root_dir):

@@ -35,7 +35,7 @@ def load(model, folder, content):
     source = CheckpointSource.find("perception.detector_path", path)
     if model.startswith("rtdetr"):
         config = source.config(DETECTORS)
-        return source.load(DETECTORS[config.model_type], config)
+        return source.load(transformers.AutoModelForObjectDetection, config)
     families = {"vjepa2": transformers.VJEPA2Model, "dinov2": transformers.Dinov2Model}
     ignored = ("predictor.", "embeddings.mask_token")
     return source.load(families[model], source.config([model]), ignored)

@@ -1,12 +1,14 @@
 """`deworldsg models get`, `list` and `inspect`, against a hub on this machine."""
 
+import hashlib
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.cli import invoke, printed, refusal
-from support.fake_hub import FakeHub
+from support.fake_hub import COMMIT, FakeHub
 
 pytest.importorskip("huggingface_hub")
 safetensors = pytest.importorskip("safetensors.numpy")
@@ -87,10 +89,41 @@ def test_a_damaged_file_is_removed_and_only_what_is_missing_is_fetched(hub, tmp_
     assert {name for _, name, _ in hub.requested} == {"model.safetensors"}
 
 
+def test_a_pinned_entry_is_fetched_and_another_content_refused(hub, tmp_path, monkeypatch):
+    digest = hashlib.sha256(WEIGHTS).hexdigest()
+    pinned = replace(CATALOGUE["dinov2-small"], revision=COMMIT, sha256=digest)
+    monkeypatch.setitem(CATALOGUE, "dinov2-small", pinned)
+    assert "licence apache-2.0; commit 0123456789ab" in get(tmp_path)
+    assert f"{digest}  model.safetensors" in (tmp_path / "dinov2-small/SHA256SUMS").read_text()
+    hub.files["model.safetensors"] = safetensors.save({"layer.weight": np.ones(2, np.float32)})
+    hub.requested.clear()
+    refused = refusal("models", "get", "dinov2-small", "--into", tmp_path)
+    assert f"the catalogue expects sha256:{digest}" in refused and hub.requested == []
+    assert (tmp_path / "dinov2-small/model.safetensors").read_bytes() == WEIGHTS
+    other = replace(pinned, revision="f" * 40)
+    monkeypatch.setitem(CATALOGUE, "dinov2-small", other)
+    assert "cannot be fetched" in refusal("models", "get", "dinov2-small", "--into", tmp_path)
+
+
+def test_the_catalogue_says_what_a_model_is(tmp_path):
+    listed = printed("models", "list", "--into", tmp_path)
+    for words in (
+        "dfine-small-obj2coco: perception.detector: transformers; 80 classes, AP 50.7 on COCO; 10 "
+        "million parameters; licence apache-2.0",
+        "grounding-dino-tiny: perception.detector: open_vocabulary; free text, AP 48.4",
+        "172 million parameters; licence apache-2.0; commit a2bb814dd30d",
+    ):
+        assert words in listed
+    for model in CATALOGUE.values():
+        assert len(model.revision) in (0, 40) and len(model.sha256) in (0, 64)
+        assert "gpl" not in model.licence.lower()
+    assert all(name in CATALOGUE for names in GROUPS.values() for name in names)
+
+
 def test_errors_name_the_remedy(hub, tmp_path):
     hub.files.pop("model.safetensors")
     for name, words in (
-        ("dino", "expected paper, embedded, detector, rtdetr_r18vd"),
+        ("dino", "expected paper, embedded, detector, open-vocabulary, dfine"),
         ("nobody/nothing", "check the network and the id"),
         ("dinov2-small", "model.safetensors"),
     ):

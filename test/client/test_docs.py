@@ -33,7 +33,7 @@ def blocks(path: Path) -> list[tuple[str, str]]:
 class FakeClient(nullcontext):
     """A live client without ROS: the graph of a file, and answers to commands."""
 
-    def __init__(self, namespace: str = "") -> None:
+    def __init__(self, namespace: str = "", *, embeddings: bool = False) -> None:
         super().__init__(self)
         self.graph = SceneGraph.load("demo_out")
 

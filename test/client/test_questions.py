@@ -1,13 +1,21 @@
 """Questions in words."""
 
 import re
+from dataclasses import replace
 
+import cv2
+import msgspec
+import numpy as np
 import pytest
 
-from deworldsg_ros.client import ClientError
-from deworldsg_ros.client.questions import Condition, Pattern, Rank, Since, ask, parse
+from deworldsg_ros.client import ClientError, SceneGraph
+from deworldsg_ros.client.grammar import Condition, Pattern, Rank, Since, parse
+from deworldsg_ros.client.meanings import COLOURS, colour_name, colour_shares
+from deworldsg_ros.client.questions import ask
 
 ON_TABLE, NEAR_CUP = Condition("on", "table"), Condition("near", "cup")
+RED, PURPLE, ORANGE = (Condition(own_colour=name) for name in ("red", "purple", "orange"))
+ON_RED = Condition("on", "table", colour="red")
 
 
 @pytest.mark.parametrize(
@@ -38,6 +46,18 @@ ON_TABLE, NEAR_CUP = Condition("on", "table"), Condition("near", "cup")
             "cup on table nearest to (1, 2, 3)",
             Pattern("cup", (ON_TABLE,), "find", Rank("nearest", None, (1.0, 2.0, 3.0))),
         ),
+        ("the red mug", Pattern("mug", (RED,))),
+        ("which mugs are red", Pattern("mugs", (RED,))),
+        ("is the mug on the red table violet", Pattern("mug", (ON_RED, PURPLE), "holds")),
+        ("red things not on the table", Pattern(None, (RED, replace(ON_TABLE, is_negated=True)))),
+        ("the red one", Pattern(None, (RED,))),
+        ("is there an orange", Pattern("orange", (), "exists")),
+        ("the orange mug near the orange", Pattern("mug", (ORANGE, Condition("near", "orange")))),
+        (
+            "cup closest to the red mug",
+            Pattern("cup", (), "find", Rank("closest", "mug", None, "red")),
+        ),
+        ("what is the color of the mug", Pattern("mug", (), "colour")),
         ("what changed since 10 s ago", Since(10.0, True)),
         ("what changed since 1750000005.5", Since(1750000005.5, False)),
         ("what changed?", Since(None, False)),
@@ -63,6 +83,8 @@ def test_patterns(question, meaning):
         ("closest cup", "closest to what"),
         ("largest cup nearest to table", "largest and nearest"),
         ("how many", "expected a class"),
+        ("what colour is", "expected a class"),
+        ("cup and reddish", "or a colour"),
         ("(" * 501, "501 characters"),
         ("what changed since yesterday", "10 s ago"),
     ],
@@ -149,7 +171,7 @@ def test_questions_of_people(room, question, found, said, note):
     ("question", "words"),
     [
         ("refridgeratr", "spelt alike: refridgerator, refrigerator"),
-        ("red mug", "'red' is not understood; 'mug' is"),
+        ("shiny mug", "'shiny' is not understood; 'mug' is"),
         ("cup on the zorb", "'zorb' is the name of no class"),
         ("((((", "'( ( ( (' is the name of no class"),
         ("x" * 400, f"'{60 * 'x'}' is"),
@@ -160,3 +182,80 @@ def test_unknown_words_are_named(room, question, words):
         ask(room, question)
     with pytest.raises(ClientError):
         room.objects(question)
+
+
+# --- colours -------------------------------------------------------------------------------------
+
+# sRGB of things that people call so.
+CALLED = {
+    "black": ("#000000", "#232124", "#1e1914"),
+    "white": ("#ffffff", "#ebebe6", "#f5f5dc", "#dcd7cd"),
+    "grey": ("#808080", "#a9a9a9", "#5a585c", "#96918a"),
+    "red": ("#ff0000", "#b22222", "#dc143c", "#8b0000", "#b43c32"),
+    "orange": ("#ffa500", "#ff8c00", "#e6781e"),
+    "brown": ("#8b4513", "#96785a", "#654321", "#d2b48c", "#a06e46"),
+    "yellow": ("#ffff00", "#ffd700", "#e6c83c", "#f0e68c"),
+    "green": ("#008000", "#00ff00", "#556b2f", "#808000", "#90ee90"),
+    "blue": ("#0000ff", "#000080", "#87ceeb", "#4682b4", "#3c5078"),
+    "purple": ("#800080", "#4b0082", "#ee82ee", "#785096"),
+    "pink": ("#ffc0cb", "#ff69b4", "#ff1493", "#e696a0"),
+}
+
+
+def lab_of(code: str) -> list[float]:
+    pixel = np.array([[list(bytes.fromhex(code[1:]))]], np.float32) / 255
+    return cv2.cvtColor(pixel, cv2.COLOR_RGB2Lab)[0, 0].tolist()
+
+
+@pytest.mark.parametrize("name", COLOURS)
+def test_names_of_colours(name):
+    for code in CALLED[name]:
+        lab = tuple(lab_of(code))
+        shares = colour_shares(lab)
+        assert (colour_name(lab), next(iter(shares))) == (name, name), code
+        assert sum(shares.values()) == pytest.approx(1.0)
+
+
+@pytest.fixture(scope="module")
+def painted(room):
+    """The room with a red cup, a green one, a grey fridge and a brown table."""
+    codes = {13: "#c03030", 40: "#2e8b57", 11: "#c8c8c0", 5: "#96785a", 39: "#2b2b33", 7: "#1e1914"}
+    nodes = [
+        msgspec.structs.replace(node, colour_lab=lab_of(codes[node.id]))
+        if node.id in codes
+        else node
+        for node in room.message.nodes
+    ]
+    return SceneGraph(msgspec.structs.replace(room.message, nodes=nodes))
+
+
+@pytest.mark.parametrize(
+    ("question", "found", "said", "note"),
+    [
+        ("the red mug", [13], None, "mug: taken as cup"),
+        ("which cups are green", [40], None, ""),
+        ("cup that is not red", [40], None, ""),
+        ("which cups are black", [], None, "nothing fulfils"),
+        ("how many red cups", [13], "1 (", ""),
+        ("is the sofa black", [39], "yes", "sofa: taken as couch"),
+        ("is the fridge red?", [], "no: nothing", ""),
+        ("what colour is the fridge", [11], "white or grey (CIELAB 80, ", "taken as refrigerator"),
+        ("what is the color of the red cup on the table?", [13], "red (CIELAB 4", ""),
+        ("what colour is the microwave", [2], "its colour is not known", ""),
+        ("cup on brown table", [13], None, ""),
+        ("cup on red table", [], None, "nothing fulfils"),
+        ("chair closest to the grey refrigerator", [15], None, ""),
+        ("anything black", [7, 39], None, ""),
+    ],
+)
+def test_questions_for_colours(painted, question, found, said, note):
+    answers = ask(painted, question)
+    assert [answer.item.id for answer in answers.found][: max(len(found), 1)] == found
+    assert (answers.said or "").startswith(said or "") and (answers.said is None) == (said is None)
+    assert any(note in one for one in ("", *answers.notes))
+
+
+def test_a_graph_without_colours_says_so(room):
+    answers = ask(room, "the red mug")
+    assert answers.found == () and any("no object of the graph has a" in n for n in answers.notes)
+    assert room[13].colour is room[13].colour_lab is None

@@ -70,6 +70,11 @@ ALL_IS_WELL = {
         (fits("late -0.2", 0.8), "late_poses", "0.2 s earlier"),
         (fits("still", 0.5), "poses_do_not_fit", "tremble"),
         ({"turns": {2: 1}}, "turned", "180 degrees in 1 frame."),
+        (
+            {"unused_detector": "models/dfine", "its_settings": "--set a=b"},
+            "unused_detector",
+            "A stronger detector is in models/dfine, and the embedded one was used.",
+        ),
         (few(100, 2, 12, classes=COCO_CLASSES), "few_detections", "80 classes: person, bicycle"),
         (few(1, 0, 3, hidden={"seen too little": 3}), "few_frames", "Only 1 frame reached"),
         (
@@ -88,8 +93,8 @@ def test_observations_become_findings(seen, code, words):
         assert words in text
         assert finding.problem and finding.remedy
         assert "{" not in text and text.endswith(".")
-        # Only a turned camera needs nothing to be done.
-        assert finding.harmless is (code == "turned")
+        # With these two, nothing has to be done.
+        assert finding.harmless is (code in ("turned", "unused_detector"))
 
 
 def test_the_reasons_are_those_of_the_nodes():

@@ -12,11 +12,10 @@ from support.recordings import encoded
 
 from deworldsg_ros.doctor import FrameSampler, Observations, find
 from deworldsg_ros.graph.graph_files import read_graph
-from deworldsg_ros.perception.stage import turned
 from deworldsg_ros.recordings import source as ros
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.recordings.writer import write_mcap
-from deworldsg_ros.scene.camera import invert_pose, rigid_motion
+from deworldsg_ros.scene.camera import invert_pose, rigid_motion, turned
 
 pytestmark = pytest.mark.timeout(400)
 

@@ -17,8 +17,7 @@ from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard, write_p
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config, MergingConfig, load_config
 from deworldsg_ros.evaluation import tables
-from deworldsg_ros.evaluation.front_ends import FrontEndChoice
-from deworldsg_ros.evaluation.pose_sources import KINDS, PoseSource, repose
+from deworldsg_ros.evaluation.front_ends import POSE_KINDS, FrontEndChoice, PoseSource, repose
 from deworldsg_ros.evaluation.predictions import ScanPrediction
 from deworldsg_ros.evaluation.rows import (
     ABLATION_3DSSG,
@@ -228,7 +227,7 @@ def test_rows_with_the_papers_networks_are_named_and_compared_with_the_paper(roo
     printed = {"fross": "FROSS", "kim": "Kim et al.", "paper": "DeWorldSG", "default": ""}
     assert {name: row.printed for name, row in rows.items()} == printed
     assert rows["paper"].title == "DeWorldSG: RT-DETR, SAM 2, EGTR, V-JEPA 2"
-    posed = rows_of("pose", [PoseSource(kind) for kind in KINDS], files=files)
+    posed = rows_of("pose", [PoseSource(kind) for kind in POSE_KINDS], files=files)
     assert posed["paper-ground-truth"].printed == "DeWorldSG"
     assert posed["paper-odometry"].printed == posed["paper-perturbed"].printed == ""
     # Without the paper's checkpoints its rules run on the embedded perception.

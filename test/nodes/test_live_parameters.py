@@ -5,11 +5,14 @@ from typing import Any
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
+from support.failing_backend import Backend
 from support.nodes_bench import CAMERA, Bench, alone, fake_perception, send_frame, works
 
 from deworldsg_ros.nodes.deworldsg_node import DeworldsgNode
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
+from deworldsg_ros.perception import Perception
+from deworldsg_ros.ros import models
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.parameters import fields
@@ -41,6 +44,8 @@ def test_thresholds_and_rates_change_while_the_node_runs(whole):
     for name in DeworldsgNode.LIVE:
         section, key = name.split(".")
         value = getattr(getattr(node.parameters, section), key)
+        if isinstance(value, tuple):
+            continue  # the words, which need another detector
         new = value + 1 if isinstance(value, int) else 0.25
         assert change(node, name, new) == (True, "")
         assert getattr(getattr(node.parameters, section), key) == new
@@ -74,6 +79,39 @@ def test_other_parameters_and_values_out_of_range_are_refused(whole):
         assert not taken
         assert says in reason
     assert node.parameters == before
+
+
+class WordsDetector(Backend):
+    words = ()
+
+    def check_words(self, words):
+        if "unicorn" in words:
+            raise ConfigurationError("perception.words 'unicorn': there are none")
+
+    def use_words(self, words, before=()):
+        self.words = words
+
+
+def test_words_change_while_the_node_runs_and_a_bad_list_is_refused(whole, monkeypatch):
+    assert "needs a detector of free text" in change(whole.node, "perception.words", ["mug"])[1]
+    detector, parts = WordsDetector(), (Backend(), Backend())
+    monkeypatch.setattr(
+        models, "build_perception", lambda config, **more: Perception(detector, *parts, config)
+    )
+    with alone(SegmentationNode) as node:
+        name = "perception.words"
+        assert change(node, name, ["mug", "red mug"]) == (True, "")
+        assert detector.words == node.parameters.perception.words == ("mug", "red mug")
+        for words, says in (
+            (["unicorn"], "'unicorn'"),
+            (["mug", ""], "1 to 64 characters"),
+            (["mug"] * 201, "at most 200"),
+            ("mug", "expected list"),
+        ):
+            taken, reason = change(node, name, words)
+            assert not taken and says in reason
+        assert detector.words == ("mug", "red mug")
+        assert change(node, name, ["drill"])[0] and detector.words == ("drill",)
 
 
 UPDATES, GRAPHS = "/scene_graph/updates.publisher", "/deworldsg/local_graph.subscription"

@@ -11,7 +11,7 @@ import pytest
 from deworldsg_ros.config import Config
 from deworldsg_ros.ros.options import NodeOptions, ReplayOptions
 
-MAX_OPTIONS = 58
+MAX_OPTIONS = 60
 MAX_MODULES = 220
 MAX_MODULE_LINES = 700
 MAX_FUNCTION_LINES = 100

@@ -17,7 +17,7 @@ ROS_NAMES = r"rclpy|tf2_\w+|launch\w*|ament_\w+|\w+_(msgs|srvs|interfaces)"
 # Modules whose distribution has another name.
 DISTRIBUTIONS = {
     **{"foxglove": "foxglove-sdk", "zenoh": "eclipse-zenoh", "cv2": "opencv-python-headless"},
-    **{"yaml": "pyyaml", "huggingface_hub": "huggingface-hub"},
+    **{"yaml": "pyyaml", "huggingface_hub": "huggingface-hub", "onnx_ir": "onnx-ir"},
 }
 
 
@@ -46,7 +46,8 @@ def imported_modules(root: Path) -> set[str]:
 
 
 def test_every_imported_library_is_a_requirement(root_dir):
-    extras = ("run", "models", "cluster", "mcp", "networkx", "fleet", "store", "view", "foxglove")
+    extras = ("run", "models", "export", "cluster", "mcp", "networkx")
+    extras += ("fleet", "store", "view", "foxglove")
     libraries = {
         DISTRIBUTIONS.get(name, name).lower()
         for name in imported_modules(root_dir) - set(sys.stdlib_module_names)

@@ -10,7 +10,7 @@ from deworldsg_ros.ros.options import FleetOptions, ViewerOptions
 
 # A loader, and the keyword that it needs.
 LOADERS = {"from_pretrained": "use_safetensors", "load": "weights_only"}
-CONFIGURATIONS = {"AutoConfig"}  # without weights
+CONFIGURATIONS = {"AutoConfig", "AutoTokenizer"}  # without weights
 # Reads pickles without running them.
 UNPICKLER = "deworldsg_ros/evaluation/predictions.py"
 ANYWHERE = ("0.0.0.0", "::", "[::]")

@@ -2,8 +2,10 @@
 
 import sys
 from collections import Counter
+from dataclasses import replace
 from itertools import islice
 
+import cv2
 import numpy as np
 import pytest
 from support import failing_backend
@@ -24,9 +26,10 @@ from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception import Detections, Perception, build_perception
 from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
+from deworldsg_ros.perception.stage import mean_colours
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.ros.health import REASONS
-from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
+from deworldsg_ros.scene.camera import Intrinsics, MaskPatch, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES
 
@@ -86,6 +89,88 @@ def test_a_table_and_a_cup():
     # Boxes are clipped to the image.
     found = perceive([[-20, -30, 60, 300]], [0], [0.9])
     assert found.frame_graph.boxes_xyxy.tolist() == [[0, 0, 60, HEIGHT - 1]]
+
+
+def test_the_colour_of_an_object_is_that_of_its_mask_without_lights_and_shadows():
+    # A red object in two parts of its patch, with a tenth of glare and of shadow, on blue.
+    rgb, instances = np.full((100, 120, 3), (0, 0, 255), np.uint8), np.zeros((100, 120), np.uint16)
+    instances[10:90, 10:40] = instances[10:90, 70:100] = 2
+    rgb[instances == 2] = 200, 30, 30
+    rgb[10:18, 10:100], rgb[82:90, 10:100] = 255, 0
+    patch, nothing = (slice(10, 90), slice(10, 100)), (slice(0, 5), slice(0, 5))
+    colours = mean_colours(rgb, instances, [nothing, patch])
+    expected = cv2.cvtColor(np.float32([[[200, 30, 30]]]) / 255, cv2.COLOR_RGB2Lab)[0, 0]
+    np.testing.assert_allclose(colours[1], expected, atol=1.5)
+    assert np.isnan(colours[0]).all() and mean_colours(rgb, instances, [nothing]) is None
+
+    found = perceive([TABLE, CUP], [0, 1], [0.6, 0.9]).frame_graph
+    cup = cv2.cvtColor(RGB[OWNER == 2][None].astype(np.float32) / 255, cv2.COLOR_RGB2Lab)[0]
+    np.testing.assert_allclose(found.colours_lab[0], np.median(cup, axis=0), atol=6)
+
+
+class CountingEmbedder:
+    """The mean colour of each crop."""
+
+    model_name = "mean colour"
+
+    def __init__(self):
+        self.crops = []
+
+    def embed(self, crops):
+        self.crops += [crop.shape for crop in crops]
+        return np.array([crop.reshape(-1, 3).mean(axis=0) for crop in crops], np.float32)
+
+
+def test_an_embedder_takes_two_objects_a_second_in_turn():
+    embedder, boxes = CountingEmbedder(), [TABLE, CUP]
+    at = with_embedder(embedder, boxes)
+    seen = {}
+    for index in range(31):  # 10 Hz
+        graph = at.perceive(replace(FRAME, stamp_ns=10**9 + index * 10**8)).frame_graph
+        if graph.embeddings is not None:
+            assert graph.embeddings.model == "mean colour"
+            seen[index] = graph.embeddings.rows.tolist()
+    # The largest one first, which is the second row; then that which waits longest.
+    assert seen == {0: [1], 5: [0], 10: [1], 15: [0], 20: [1], 25: [0], 30: [1]}
+    height, width, _ = embedder.crops[1]
+    x1, y1, x2, y2 = CUP
+    assert max(x2 - x1, y2 - y1) < height == width <= 1.1 * max(x2 - x1, y2 - y1) + 3
+    # A frame after a long time has all that a second has.
+    later = at.perceive(replace(FRAME, stamp_ns=9 * 10**10)).frame_graph
+    assert later.embeddings.rows.tolist() == [0, 1]
+    np.testing.assert_allclose(np.linalg.norm(later.embeddings.vectors, axis=1), 1, atol=1e-3)
+
+
+def test_a_failing_embedder_loses_only_the_embeddings(caplog):
+    embedder = CountingEmbedder()
+    at = with_embedder(embedder, [TABLE, CUP])
+    embedder.embed = None
+    found = at.perceive(FRAME)
+    assert found.drops == {"embedder_error": 2} and "embedder_error" in REASONS
+    assert len(found.frame_graph) == 2 and found.frame_graph.embeddings is None
+    assert "the embedder failed" in caplog.text
+
+
+def with_embedder(embedder, boxes):
+    head = GeometricRelationHead(REPLICA_SSG_PREDICATES)
+    detector = ListedDetector(boxes, [0, 1], [0.6, 0.9])
+    config = PerceptionConfig()
+    return Perception(detector, RgbdSegmenter(), head, config, world_up="z", embedder=embedder)
+
+
+def test_the_masks_of_a_detector_are_used_as_they_are():
+    class MaskingDetector(ListedDetector):
+        def detect(self, rgb, score_threshold):
+            found = super().detect(rgb, score_threshold)
+            masks = (MaskPatch(0, 0, OWNER == 1), MaskPatch(0, 0, OWNER == 2))
+            return replace(found, masks=masks[: len(found)])
+
+    made = stage(MaskingDetector([TABLE, CUP], [0, 1], [0.6, 0.9]))
+    made._segmenter = None
+    found = made.perceive(FRAME)
+    assert found.frame_graph.scores.tolist() == [0.9, 0.6]
+    for label, value in ((1, 2), (2, 1)):
+        assert np.array_equal(found.instances == label, value == OWNER)
 
 
 VIEW = [0.03 * WIDTH, 0.03 * HEIGHT, 0.97 * WIDTH, 0.97 * HEIGHT]
@@ -186,7 +271,7 @@ def test_an_unknown_backend_is_refused(settings, offender):
     ("field", "name"), [("detector", "rtdetr"), ("segmenter", "sam2"), ("segmenter", "sam")]
 )
 def test_without_torch_the_error_names_the_package_to_install(field, name, monkeypatch):
-    for module in ("rtdetr", "sam"):
+    for module in ("closed_set", "sam"):
         monkeypatch.setitem(sys.modules, f"deworldsg_ros.perception.backends.{module}", None)
     with pytest.raises(ConfigurationError, match=f"'{name}'.*pip install torch"):
         build_perception(PerceptionConfig(**{field: name}))

@@ -12,8 +12,8 @@ from support.perception import INTRINSICS, SHAPE, box_of
 
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception import Perception
-from deworldsg_ros.perception.stage import Uprighter, turned, turned_back
-from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.perception.stage import turned_back
+from deworldsg_ros.scene.camera import RgbdFrame, Uprighter, turned
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 
 # A level camera that looks along +y of a world whose z points up.

@@ -49,6 +49,8 @@ def test_overrides_by_full_name():
     assert parameters.inputs.world_up == "y"
     assert parameters.node.map_path == "m"
     assert parameters.output.rate_hz == 5.0  # a whole number is a number
+    assert resolve({"perception.words": None}).perception.words == ()  # [] in a file
+    assert resolve({"perception.words": ["red mug"]}).perception.words == ("red mug",)
 
 
 @pytest.mark.parametrize(
@@ -64,6 +66,9 @@ def test_overrides_by_full_name():
         ("inputs.reliability", "often", "expected one of auto, best_effort, reliable"),
         ("inputs.world_up", True, "put it in quotes"),
         ("output.include_surface_points", "yes", "expected bool"),
+        ("perception.words", "mug", "is 'mug', expected list at most 200 of 1 to 64 characters"),
+        ("perception.words", ["mug", "c" * 65], "is ['mug', 'ccc"),
+        ("perception.words", ["mug"] * 201, "…, expected list"),
     ],
 )
 def test_a_bad_override_is_refused_in_one_line(name, value, says):

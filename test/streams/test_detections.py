@@ -17,7 +17,7 @@ NAMED = [(BOX, {"red mug": 0.6, "cup": 0.3}), (OTHER, {"desk": 0.9})]
 
 def one(**changes):
     """A message of one object, with changes."""
-    message = wire_message([(BOX, {"mug": 0.5})])
+    message = wire_message([(BOX, {"mug": 0.5})], embedding_model="clip")
     message.detections = [msgspec.structs.replace(message.detections[0], **changes)]
     return message
 
@@ -77,6 +77,15 @@ def test_masks_and_embeddings_arrive_to_the_bit():
 def test_what_is_wrong_is_named(changes, words):
     with pytest.raises(RefusedInput, match=words):
         sent_detections(one(**changes), 8, 6)
+
+
+def test_an_object_may_lack_an_embedding_but_no_model_its_name():
+    message = wire_message(NAMED, embedding_model="clip")
+    message.detections[1].embedding = np.ones(3, "<f2").tobytes()
+    assert sent_detections(message, 8, 6).embeddings.tolist() == [[0, 0, 0], [1, 1, 1]]
+    message.embedding_model = ""
+    with pytest.raises(RefusedInput, match="without embedding_model"):
+        sent_detections(message, 8, 6)
 
 
 def test_masks_of_some_objects_or_of_another_image_are_refused():

@@ -41,6 +41,9 @@ class FakeHub:
         }
         return json.dumps(info).encode()
 
+    def metadata_path(self, revision: str) -> str:
+        return f"/api/models/{self.repository}/revision/{revision}"
+
     @contextmanager
     def serving(self) -> Iterator[FakeHub]:
         hub = self
@@ -51,7 +54,7 @@ class FakeHub:
 
             def do_GET(self) -> None:
                 path = self.path.partition("?")[0]
-                if path == f"/api/models/{hub.repository}":
+                if path in (f"/api/models/{hub.repository}", hub.metadata_path(COMMIT)):
                     return self._send(200, hub.metadata(), {})
                 prefix = f"/{hub.repository}/resolve/{COMMIT}/"
                 name = path.removeprefix(prefix)

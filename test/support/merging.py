@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeStates
-from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import Embeddings, LocalGraph, Relations, Vocabulary
 from deworldsg_ros.wire import messages as wire
 
 VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
@@ -61,6 +61,23 @@ def random_classes(rng: np.random.Generator, count: int, classes: int = 4) -> ND
     logits = rng.normal(0, 3.0, (count, classes))
     powers = np.exp(logits - logits.max(axis=1, keepdims=True))
     return powers / powers.sum(axis=1, keepdims=True)
+
+
+def random_colours(objects: NDArray[np.int64], stamp_ns: int) -> NDArray[np.float32] | None:
+    """CIELAB colours (n, 3) of objects, with noise; unknown in some frames and of some objects."""
+    rng = np.random.default_rng(stamp_ns)
+    colours = rng.normal(0, 2, (len(objects), 3)) + [50, 0, 0] + 5 * objects[:, None]
+    colours[rng.random(len(objects)) < 0.2] = np.nan
+    return None if stamp_ns % 5 == 0 or np.isnan(colours).all() else colours.astype(np.float32)
+
+
+def random_embeddings(count: int, seed: int) -> Embeddings | None:
+    """Embeddings of some of the objects of a frame; None of none."""
+    rng = np.random.default_rng(seed)
+    rows = np.flatnonzero(rng.random(count) < 0.6)
+    vectors = rng.normal(size=(len(rows), 4))
+    unit = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float16)
+    return Embeddings(rows, unit, "tiny") if len(rows) else None
 
 
 def local_graph(
@@ -131,6 +148,8 @@ def random_local_graphs(rng: np.random.Generator, frames: int) -> list[LocalGrap
                 ),
                 pairs=pairs,
                 logits=rng.normal(0, 2, (len(pairs), 3)),
+                colours_lab=random_colours(seen, stamp_ns),
+                embeddings=random_embeddings(count, stamp_ns),
             )
         )
     return graphs

@@ -7,6 +7,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 transformers = pytest.importorskip("transformers")
+tokenizers = pytest.importorskip("tokenizers")
 
 from safetensors.torch import save_file  # noqa: E402  after the guards
 
@@ -62,10 +63,11 @@ def random_rtdetr(version=1, **changes):
         if version == 1
         else transformers.RTDetrV2ForObjectDetection
     )
-    return _randomised(family(config).eval())
+    return randomised(family(config).eval())
 
 
-def _randomised(model):
+def randomised(model):
+    """The network with outputs that differ. The default initialisation makes them equal."""
     with torch.no_grad():
         for name, value in model.named_parameters():
             if value.ndim > 1:
@@ -171,7 +173,7 @@ def save_sam2(folder, video=False):
     return save_segmenter(folder, family, sam2_config(video))
 
 
-def save_sam3(folder, video=False):
+def save_sam3(folder, video=False, text=None):
     """Save a small SAM 3: its tracker alone, or detector and tracker as published."""
     vision = {
         "backbone_config": {
@@ -191,7 +193,7 @@ def save_sam3(folder, video=False):
         config = transformers.Sam3TrackerConfig(**tracker)
         return save_segmenter(folder, transformers.Sam3TrackerModel, config)
     small = {"hidden_size": 32, "intermediate_size": 32, "num_attention_heads": 2}
-    text = {"num_hidden_layers": 1, "projection_dim": 32, "vocab_size": 99}
+    text = {"num_hidden_layers": 1, "projection_dim": 32, "vocab_size": 99, **(text or {})}
     config = transformers.Sam3VideoConfig(
         detector_config=transformers.Sam3Config(
             vision_config=transformers.Sam3VisionConfig(**vision),
@@ -270,8 +272,91 @@ def save_dfine(folder):
         id2label=dict(enumerate(CLASSES)),
         label2id={name: index for index, name in enumerate(CLASSES)},
     )
-    model = _randomised(transformers.DFineForObjectDetection(config).eval())
+    model = randomised(transformers.DFineForObjectDetection(config).eval())
     model.save_pretrained(folder)
     preprocessing = {"size": {"height": 64, "width": 64}, "do_normalize": False}
+    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
+    return model
+
+
+# Of CLIP and SigLIP: words of their texts, and sizes of both towers.
+WORDS = ["<pad>", "<unk>", "<s>", "</s>", "a", "cup", "red", "sofa", "to", "drink", "from"]
+TOWER = {
+    **{"hidden_size": 16, "intermediate_size": 24, "num_attention_heads": 2},
+    "num_hidden_layers": 2,
+}
+
+
+def save_two_towers(folder, family="clip"):
+    """A CLIP or SigLIP with random weights, with a tokenizer of a few words; the whole model."""
+    torch.manual_seed(0)
+    text = {**TOWER, "vocab_size": len(WORDS), "max_position_embeddings": 9}
+    text |= {"pad_token_id": 0, "bos_token_id": 2, "eos_token_id": 3}
+    vision = {**TOWER, "image_size": 32, "patch_size": 8}
+    if family == "clip":
+        config = transformers.CLIPConfig(text_config=text, vision_config=vision, projection_dim=12)
+        model = transformers.CLIPModel(config)
+    else:
+        config = transformers.SiglipConfig(text_config=text, vision_config=vision)
+        model = transformers.SiglipModel(config)
+    model = randomised(model.eval())
+    model.save_pretrained(folder)
+    size = {"shortest_edge": 32} if family == "clip" else {"height": 32, "width": 32}
+    content = {"size": size, "do_normalize": True, **IMAGENET}
+    (folder / "preprocessor_config.json").write_text(json.dumps(content))
+    words = {word: index for index, word in enumerate(WORDS)}
+    core = tokenizers.Tokenizer(tokenizers.models.WordLevel(words, unk_token="<unk>"))
+    core.pre_tokenizer = tokenizers.pre_tokenizers.Whitespace()
+    core.post_processor = tokenizers.processors.TemplateProcessing(
+        single="<s> $A </s>", special_tokens=[("<s>", 2), ("</s>", 3)]
+    )
+    special = {"unk_token": "<unk>", "pad_token": "<pad>", "eos_token": "</s>", "bos_token": "<s>"}
+    transformers.PreTrainedTokenizerFast(tokenizer_object=core, **special).save_pretrained(folder)
+    return model
+
+
+def save_closed_set(folder, family):
+    """A small detector of a family, saved as on the model hub; its network."""
+    torch.manual_seed(0)
+    names = ("N/A", *CLASSES)  # as the ids of COCO
+    shared = {
+        **{"d_model": WIDTH, "num_queries": 12, "decoder_layers": 2, "decoder_ffn_dim": 32},
+        "id2label": dict(enumerate(names)),
+        "label2id": {name: index for index, name in enumerate(names)},
+    }
+    detr = {"encoder_layers": 1, "encoder_ffn_dim": 32, "use_timm_backbone": False}
+    detr |= {"encoder_attention_heads": 2, "decoder_attention_heads": 2, **shared}
+    backbone = {"embedding_size": 8, "hidden_sizes": [8, 16, 24, 32], "depths": [1] * 4}
+    last = transformers.ResNetConfig(**backbone, layer_type="basic", out_features=["stage4"])
+    three = [f"stage{n}" for n in (2, 3, 4)]
+    several = transformers.ResNetConfig(**backbone, layer_type="basic", out_features=three)
+    vit = {"hidden_size": 32, "num_hidden_layers": 4, "num_attention_heads": 2}
+    if family == "detr":
+        config = transformers.DetrConfig(backbone_config=last, **detr)
+    elif family == "deformable_detr":
+        config = transformers.DeformableDetrConfig(backbone_config=several, **detr)
+    elif family == "yolos":
+        config = transformers.YolosConfig(
+            **{**vit, "intermediate_size": 32, "image_size": [64, 96], "num_detection_tokens": 12},
+            **{key: shared[key] for key in ("id2label", "label2id")},
+        )
+    else:
+        dinov2 = {**vit, "model_type": "rf_detr_dinov2", "mlp_ratio": 1, "image_size": 64}
+        dinov2 |= {"patch_size": 16, "num_windows": 2, "out_features": ["stage2", "stage4"]}
+        heads = {"decoder_self_attention_heads": 2, "decoder_cross_attention_heads": 2}
+        config = transformers.RfDetrConfig(
+            **{**shared, **heads, "backbone_config": dinov2, "c2f_num_blocks": 1}
+        )
+    model = randomised(transformers.AutoModelForObjectDetection.from_config(config).eval())
+    for name, part in model.named_modules():
+        if "class" in name and getattr(part, "out_features", 0) in (len(names), len(names) + 1):
+            with torch.no_grad():  # no training ever asked for it
+                part.weight[0], part.bias[0] = 0.0, -20.0
+    model.save_pretrained(folder)
+    edges = {"shortest_edge": 64, "longest_edge": 100}
+    size = {"height": 64, "width": 64} if family == "rf_detr" else edges
+    preprocessing = {"size": size, "do_normalize": True, **IMAGENET}
+    if family == "detr":  # as older versions of transformers saved it
+        preprocessing |= {"size": 64, "max_size": 100}
     (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
     return model

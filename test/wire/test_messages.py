@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 from support.merging import (
     VOCABULARY,
     random_classes,
+    random_colours,
     random_covariances,
+    random_embeddings,
     random_pose,
     seeds,
 )
@@ -83,6 +85,8 @@ def random_objects(rng: np.random.Generator, count: int) -> dict[str, Any]:
             rng.normal(0, 10 ** rng.uniform(-6, 6), (len(pairs), 3)),
             rng.random(len(pairs)),
         ),
+        "colours_lab": random_colours(rng.integers(0, 9, count), int(rng.integers(1000))),
+        "embeddings": random_embeddings(count, int(rng.integers(1000))),
     }
 
 
@@ -239,6 +243,11 @@ def base64_of(*numbers: float) -> str:
     return base64.b64encode(np.array(numbers, "<f4").tobytes()).decode()
 
 
+def half(*numbers: float) -> str:
+    """The numbers as float16."""
+    return base64.b64encode(np.array(numbers, "<f2").tobytes()).decode()
+
+
 def changed(name: str, path: str, value: object) -> dict[str, Any]:
     """An example with a value deep in it, e.g. at `objects.0.mean_m`; DELETED removes it."""
     content: Any = example(name)
@@ -274,6 +283,9 @@ BY_SCHEMA: list[tuple[str, str, object]] = [
     ("frame_graph", "relations.0.score", 1.5),
     ("frame_graph", "width", -640),
     ("local_graph", "T_world_camera", [1.0] * 12),
+    ("frame_graph", "objects.0.colour_lab", [500.0, 0.0, 0.0]),
+    ("scene_graph", "nodes.0.colour_lab", [50.0, 0.0]),
+    ("embeddings", "nodes.0.vector", 3),
     ("local_graph", "objects.0.instance", 0),
     ("local_graph", "objects.0.instance", 2**16),
     ("local_graph", "objects.0.score", 1.5),
@@ -324,6 +336,15 @@ BY_READER: list[tuple[str, str, object]] = [
     ("local_graph", "T_world_camera", np.diag([1.0, 1, 1, 2]).ravel().tolist()),
     ("local_graph", "T_world_camera.3", 1e300),
     ("local_graph", "classes", ["cup", "table", "bo\x1bok"]),
+    ("local_graph", "objects.0.colour_lab", [-3.0, 0.0, 0.0]),
+    ("local_graph", "objects.0.embedding", half(1.0, np.nan, 0.0, 0.0)),
+    ("local_graph", "objects.0.embedding", half(3.0, 0.0, 0.0, 0.0)),
+    ("local_graph", "objects.0.embedding", half(1.0, 0.0)),  # shorter than the other one
+    ("local_graph", "objects.0.embedding", "AAAA"),
+    ("local_graph", "embedding_model", DELETED),
+    ("frame_graph", "embedding_model", "a\x1b[2J"),
+    ("embeddings", "model", "a\x1b[2J"),
+    ("embeddings", "nodes", twice),
     ("local_graph", "classes", []),
     ("local_graph", "frame_id", "m" * 1000),
     ("local_graph", "frame_id", "map\n[ERROR] forged"),

@@ -23,8 +23,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config
-from deworldsg_ros.evaluation.front_ends import FrontEndChoice, Kind, build_front_end
-from deworldsg_ros.evaluation.pose_sources import PoseSource, repose
+from deworldsg_ros.evaluation.front_ends import (
+    FrontEndChoice,
+    Kind,
+    PoseSource,
+    build_front_end,
+    repose,
+)
 from deworldsg_ros.evaluation.recorded_room import RecordedRoom, open_annotations
 from deworldsg_ros.evaluation.rows import HARD, Condition
 from deworldsg_ros.lifting.stage import Lifting

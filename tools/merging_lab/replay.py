@@ -43,8 +43,7 @@ from deworldsg_ros.evaluation.scoring import ProtocolOptions, ScanResult, pool, 
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.recordings.folders.annotations import Annotations, ScanPoints
 from deworldsg_ros.relations.clips import LiveGraph
-from deworldsg_ros.relations.registry import build_world_model
-from deworldsg_ros.relations.stage import RelationReasoner
+from deworldsg_ros.relations.stage import RelationReasoner, build_world_model
 from deworldsg_ros.wire import messages as wire
 
 NO_IMAGE = np.zeros((0, 0, 3), np.uint8)

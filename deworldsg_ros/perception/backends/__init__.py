@@ -1,3 +1,3 @@
-"""Detectors (`nanodet`, `rtdetr`), segmenters (`rgbd`, `sam2`, `sam`), relation heads
-(`geometric`, `egtr`): one module each.
+"""Detectors (`nanodet`, `closed_set`, `open_vocabulary`), segmenters (`rgbd`, `sam`), relation
+heads (`geometric`, and `egtr` in `closed_set`).
 """

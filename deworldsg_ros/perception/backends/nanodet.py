@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ import onnxruntime
 
 from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt8, pairwise_iou, softmax
+from deworldsg_ros.scene.camera import MaskPatch
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabulary import COCO_CLASSES
 
@@ -141,14 +142,7 @@ class NanoDetDetector:
             raise ConfigurationError(
                 f"NanoDet weights {weights}: no such file, install the package again"
             )
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        # Spinning threads would keep cores busy between frames, which other nodes need.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        self._session = onnxruntime.InferenceSession(
-            str(weights), options, providers=["CPUExecutionProvider"]
-        )
+        self._session = open_session(weights, threads)
         nothing = np.zeros((1, INPUT_SIZE, INPUT_SIZE, 4), np.uint8)
         self._tables = Tables(*self._session.run(list(Tables._fields), {"pixels": nothing}))
 
@@ -165,6 +159,16 @@ class NanoDetDetector:
         height, width = rgb.shape[:2]
         # Pixel centres are at integers here, and at halves in the network.
         return np.clip(boxes / scale - 0.5, -0.5, [width - 0.5, height - 0.5] * 2), class_scores
+
+
+def open_session(network: Path, threads: int) -> Any:
+    """A network on the CPU; `threads` 0 = all cores."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    # Spinning threads would keep cores busy between frames, which other nodes need.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return onnxruntime.InferenceSession(str(network), options, providers=["CPUExecutionProvider"])
 
 
 def letterbox(rgb: UInt8, input_codes: UInt8) -> tuple[UInt8, float]:
@@ -221,6 +225,7 @@ def combine(
     class_scores: Float64,
     score_threshold: float,
     calibration: Callable[[Float64], Float64] = CALIBRATION,
+    masks: Sequence[MaskPatch] | None = None,
 ) -> Detections:
     """Candidates → objects: suppression, and combined class scores of nearly identical boxes.
 
@@ -229,9 +234,10 @@ def combine(
 
     Args:
         boxes_xyxy: (k, 4) pixels.
-        class_scores: (k, 80) sigmoid scores.
+        class_scores: (k, C) sigmoid scores.
         score_threshold: minimum score of an object.
-        calibration: scores (n, 80) to distributions.
+        calibration: scores (n, C) to distributions.
+        masks: k masks, of which the objects keep theirs; None = none.
     """
     best = class_scores.max(axis=1) if len(class_scores) else np.zeros(0)
     # A box never suppresses a better one.
@@ -249,4 +255,5 @@ def combine(
     near = pairwise_iou(boxes_xyxy[kept], boxes_xyxy) > ANY_CLASS_IOU
     for row in range(len(kept)):
         evidence[row] = class_scores[near[row]].max(axis=0)
-    return Detections(boxes_xyxy[kept], calibration(evidence), best[kept])
+    kept_masks = None if masks is None else tuple(masks[row] for row in kept)
+    return Detections(boxes_xyxy[kept], calibration(evidence), best[kept], masks=kept_masks)

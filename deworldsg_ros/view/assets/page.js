@@ -268,6 +268,7 @@ function showCard(id) {
     ["class", classes.join(", ")],
     ["is an object", node.existence === null ? null : percent(node.existence)],
     ["size", `${node.size.map(side => (100 * side).toFixed(0)).join(" × ")} cm`],
+    ["colour", node.looks],
     ["position", `${node.position.map(value => value.toFixed(2)).join(", ")} m`],
     ["seen in", `${node.observations} frame${node.observations === 1 ? "" : "s"}`],
   ]) if (text !== null) facts.append(element("dt", "", term), element("dd", "", text));

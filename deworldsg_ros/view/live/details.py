@@ -62,6 +62,7 @@ def object_html(item: SceneObject, relations: Sequence[Relation], photo: bytes |
         "class": uncertainty(item),
         "looks": f"{counted(item.observations, 'frame')} over {seconds:.1f} s",
         "size": f"{size} cm (length, width, height)",
+        "colour": item.colour or "",
         "place": f"{position} m",
     }
     return "".join(

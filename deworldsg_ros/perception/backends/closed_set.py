@@ -1,11 +1,16 @@
-"""RT-DETR and relatives on torch, and EGTR, the relation head on queries: the paper's models."""
+"""Detectors of fixed classes on torch, and EGTR, the relation head on queries.
+
+RT-DETR with EGTR is the paper's.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+import transformers
 from safetensors.torch import load_file
 
 from deworldsg_ros.checkpoints.cards import (
@@ -29,21 +34,24 @@ from deworldsg_ros.checkpoints.loading import (
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.backends.image_tensors import Preprocessing
 from deworldsg_ros.perception.protocols import Detections, Detector, SegmentedObjects
-from deworldsg_ros.scene.arrays import Float64, UInt8
+from deworldsg_ros.scene.arrays import Float64, Int64, UInt8, corners_of
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import Relations
 from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
 
-# --- RT-DETR, RT-DETRv2 and D-FINE on torch. The first is the paper's detector.
+# --- Detectors that `AutoModelForObjectDetection` loads; RT-DETR is the paper's.
 #
 # Each object is one query of the decoder. Overlapping boxes are not suppressed.
 
-# The public checkpoints take 640 x 640 images, scaled to [0, 1] and not normalised.
+# The public checkpoints of RT-DETR take 640 x 640 images, scaled to [0, 1] and not normalised.
 PUBLIC_PREPROCESSING = Preprocessing(640, 640)
+RT_DETR = ("rt_detr", "rt_detr_v2", "d_fine")
+# Outputs without a class, as the ids of COCO have them.
+NO_CLASS = ("n/a", "background", "")
 
 
-class RtDetrDetector:
-    """Detector on a checkpoint of RT-DETR, RT-DETRv2 or D-FINE.
+class ClosedSetDetector:
+    """Detector on a checkpoint of fixed classes: RT-DETR, D-FINE, RF-DETR and others.
 
     Args:
         config: the section `perception`: `detector_path` and `device`.
@@ -57,6 +65,7 @@ class RtDetrDetector:
         card: settings of the checkpoint.
         source: folder or hub id of the checkpoint.
         device: device of the network.
+        preprocess: makes the network's input of an image.
         model: the network.
     """
 
@@ -68,14 +77,18 @@ class RtDetrDetector:
         self.device = choose_device("perception.device", config.device)
         network = self.source.config(DETECTORS)
         self.card = read_detector_card(self.source.file(DETECTOR_CARD))
-        self.classes = _class_names(network, self.card, self.source)
+        self.reading = ClassReading.of(network, self.card, self.source)
+        self.classes = self.reading.classes
         self.default_score_threshold = (
             DEFAULT_SCORE_THRESHOLD[self.card.class_scores]
             if self.card.score_threshold is None
             else self.card.score_threshold
         )
-        self._preprocess = Preprocessing.of_checkpoint(self.source, PUBLIC_PREPROCESSING)
-        model = self.source.load(DETECTORS[network.model_type], network)
+        is_rt_detr = network.model_type in RT_DETR
+        self.preprocess = Preprocessing.of_checkpoint(
+            self.source, PUBLIC_PREPROCESSING if is_rt_detr else None
+        )
+        model = self.source.load(transformers.AutoModelForObjectDetection, network)
         _use_layers(model, self.card.decoder_layers, self.source)
         self._recorder: QueryRecorder | None = None
         with enough_memory("loading the detector", "choose a smaller perception.detector_path"):
@@ -84,7 +97,7 @@ class RtDetrDetector:
             )
             self.model = model.to(memory_format=torch.channels_last)
             # The first pass allocates memory and tunes kernels; do it at start-up.
-            self._forward(np.zeros((self._preprocess.height, self._preprocess.width, 3), np.uint8))
+            self._forward(np.zeros((self.preprocess.height, self.preprocess.width, 3), np.uint8))
 
     def record_queries(self) -> None:
         """From now on, `detect` also returns the query features of each object."""
@@ -96,7 +109,7 @@ class RtDetrDetector:
         output = self._forward(rgb)
         require_finite(output.logits, "detector_error", "the class logits")
         require_finite(output.pred_boxes, "detector_error", "the boxes")
-        probabilities, scores = class_distributions(output.logits[0].float(), self.card)
+        probabilities, scores = self.reading(output.logits[0].float())
         rows = torch.nonzero(scores >= score_threshold)[:, 0]
         rows = rows[torch.argsort(scores[rows], descending=True, stable=True)]
         features = None
@@ -113,13 +126,13 @@ class RtDetrDetector:
     @torch.inference_mode()
     def _test_scores(self, model: Any, dtype: torch.dtype) -> torch.Tensor:
         """Sorted scores of the queries for a fixed image; their order may differ by rounding."""
-        image = noise_pattern(self._preprocess.height, self._preprocess.width, 3).numpy()
-        logits: torch.Tensor = model(self._preprocess(image, self.device, dtype)).logits
+        image = noise_pattern(self.preprocess.height, self.preprocess.width, 3).numpy()
+        logits: torch.Tensor = model(self.preprocess(image, self.device, dtype)).logits
         return logits.float().amax(dim=-1).sort().values
 
     @torch.inference_mode()
     def _forward(self, rgb: UInt8) -> Any:
-        pixels = self._preprocess(rgb, self.device, self.dtype)
+        pixels = self.preprocess(rgb, self.device, self.dtype)
         return self.model(pixels.contiguous(memory_format=torch.channels_last))
 
 
@@ -157,42 +170,79 @@ class QueryRecorder:
         return keep
 
 
-def class_distributions(
-    logits: torch.Tensor, card: CheckpointCard
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Class distributions (n, C) and scores (n,) of class logits (n, C).
+@dataclass(frozen=True)
+class ClassReading:
+    """How class logits become class distributions and scores.
 
     The distribution is softmax(logits / temperature). Normalised sigmoids are no alternative:
     many small ones would outweigh the correct one (Eq. 5). The score of a softmax checkpoint is
-    the maximum of the distribution, as in FROSS and the paper. The score of a sigmoid checkpoint
-    is its largest sigmoid.
+    the maximum of the distribution, as in FROSS and the paper; if its last output is "no object",
+    that of the distribution with this output. The score of a sigmoid checkpoint is its largest
+    sigmoid.
+
+    Attributes:
+        classes: names.
+        columns: (C,) int64, output of each class.
+        card: settings of the checkpoint.
+        no_object: whether the last output is "no object".
     """
-    probabilities = torch.softmax(logits / card.temperature, dim=-1)
-    scores = probabilities if card.class_scores == "softmax" else torch.sigmoid(logits)
-    return probabilities, scores.amax(dim=-1)
 
+    classes: tuple[str, ...]
+    columns: Int64
+    card: CheckpointCard
+    no_object: bool
 
-def _class_names(network: Any, card: CheckpointCard, source: CheckpointSource) -> tuple[str, ...]:
-    names = card.classes or tuple(name for _, name in sorted(network.id2label.items()))
-    if len(names) != network.num_labels or len(set(names)) != len(names):
-        raise ConfigurationError(
-            f"{source.parameter} '{source.name}' names {len(set(names))} classes, expected one for "
-            f"each of its {network.num_labels} outputs: name each once, in `classes` of "
-            f"{DETECTOR_CARD} or in `id2label` of config.json"
-        )
-    if all(name == f"LABEL_{index}" for index, name in enumerate(names)):
-        raise ConfigurationError(
-            f"{source.parameter} '{source.name}' does not name its {len(names)} classes: name them "
-            f"in `classes` of {DETECTOR_CARD} in its folder"
-        )
-    return names
+    @staticmethod
+    def of(network: Any, card: CheckpointCard, source: CheckpointSource) -> ClassReading:
+        """The reading of a checkpoint; raises ConfigurationError if it does not name its classes.
+
+        Args:
+            network: configuration of the checkpoint.
+            card: settings of the checkpoint.
+            source: for messages.
+        """
+        names = card.classes or tuple(name for _, name in sorted(network.id2label.items()))
+        columns = [k for k, name in enumerate(names) if str(name).lower() not in NO_CLASS]
+        classes = tuple(str(names[column]) for column in columns)
+        numbered = card.classes or sorted(network.id2label) == list(range(network.num_labels))
+        if len(names) != network.num_labels or len(set(classes)) < len(classes) or not numbered:
+            raise ConfigurationError(
+                f"{source.parameter} '{source.name}' names {len(set(classes))} classes, expected "
+                f"one for each of its {network.num_labels} outputs: name each once, in `classes` "
+                f"of {DETECTOR_CARD} or in `id2label` of config.json"
+            )
+        if all(name == f"LABEL_{index}" for index, name in enumerate(names)):
+            raise ConfigurationError(
+                f"{source.parameter} '{source.name}' does not name its {len(names)} classes: name "
+                f"them in `classes` of {DETECTOR_CARD} in its folder"
+            )
+        no_object = DETECTORS[network.model_type] == "softmax"
+        return ClassReading(classes, np.array(columns, np.int64), card, no_object)
+
+    def __call__(self, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Class distributions (n, C) and scores (n,) of all outputs (n, C + …)."""
+        columns = torch.from_numpy(self.columns).to(logits.device)
+        used = logits[:, columns]
+        probabilities = torch.softmax(used / self.card.temperature, dim=-1)
+        if self.no_object:
+            scores = torch.softmax(logits, dim=-1)[:, columns]
+        elif self.card.class_scores == "softmax":
+            scores = probabilities
+        else:
+            scores = torch.sigmoid(used)
+        return probabilities, scores.amax(dim=-1)
 
 
 def _use_layers(model: Any, used: int, source: CheckpointSource) -> None:
     """Drop the later layers of the decoder; each layer has class and box heads of its own."""
     if not used:
         return
-    decoder = model.model.decoder
+    decoder: Any = getattr(model.model, "decoder", None)
+    if not hasattr(decoder, "class_embed"):
+        raise ConfigurationError(
+            f"{source.parameter} '{source.name}': decoder_layers in {DETECTOR_CARD} is {used}, but "
+            f"layers of a {type(model).__name__} cannot be dropped: set it to 0"
+        )
     count = len(decoder.layers)
     if used > count:
         raise ConfigurationError(
@@ -205,9 +255,7 @@ def _use_layers(model: Any, used: int, source: CheckpointSource) -> None:
 
 def _pixel_boxes(boxes_cxcywh: Float64, width: int, height: int) -> Any:
     """Centre, width and height in [0, 1] to corners in pixels, pixel centres at integers."""
-    centres, halves = boxes_cxcywh[:, :2], boxes_cxcywh[:, 2:] / 2
-    corners = np.hstack([centres - halves, centres + halves])
-    return corners * [width, height, width, height] - 0.5
+    return corners_of(boxes_cxcywh) * [width, height, width, height] - 0.5
 
 
 def _normalised(probabilities: Float64) -> Any:
@@ -218,7 +266,7 @@ def _numpy(tensor: torch.Tensor) -> Float64:
     return tensor.detach().cpu().double().numpy()
 
 
-# --- The EGTR relation head on torch: it reads the queries of the detector `rtdetr`.
+# --- The EGTR relation head on torch: it reads the queries of an RT-DETR.
 
 
 class EgtrRelationHead:
@@ -230,7 +278,7 @@ class EgtrRelationHead:
 
     Args:
         config: the section `perception`: `predicate_set`.
-        detector: an `RtDetrDetector` whose checkpoint folder also contains the head. From now on
+        detector: an `ClosedSetDetector` whose checkpoint folder also contains the head. From now on
             it records its queries.
 
     Raises:
@@ -242,7 +290,7 @@ class EgtrRelationHead:
     """
 
     def __init__(self, config: PerceptionConfig, detector: Detector) -> None:
-        if not isinstance(detector, RtDetrDetector):
+        if not isinstance(detector, ClosedSetDetector):
             raise ConfigurationError(
                 f"perception.detector is '{config.detector}', but perception.relation_head 'egtr' "
                 "reads the queries of the detector 'rtdetr': set perception.detector to 'rtdetr', "
@@ -314,7 +362,7 @@ def _load(source: CheckpointSource) -> EgtrNetwork:
 
 
 def _checked_predicates(
-    network: EgtrNetwork, predicate_set: str, detector: RtDetrDetector
+    network: EgtrNetwork, predicate_set: str, detector: ClosedSetDetector
 ) -> tuple[str, ...]:
     """Names of the head's predicates, if they are those of the predicate set."""
     name, names = detector.source.name, detector.card.predicates
@@ -333,7 +381,7 @@ def _checked_predicates(
     return names
 
 
-def _check_detector(network: EgtrNetwork, detector: RtDetrDetector) -> None:
+def _check_detector(network: EgtrNetwork, detector: ClosedSetDetector) -> None:
     """Refuse a detector with other queries, layers or classes than those of the head's training."""
     name = detector.source.name
     expected = network.final_sub_proj.in_features, len(network.proj_q)

@@ -22,7 +22,7 @@ from deworldsg_ros.checkpoints import cards
 from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, CheckpointCard
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
 from deworldsg_ros.perception import build_perception
-from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector
+from deworldsg_ros.perception.backends.closed_set import ClosedSetDetector, EgtrRelationHead
 from deworldsg_ros.scene.errors import ConfigurationError
 
 pytestmark = pytest.mark.models
@@ -41,7 +41,7 @@ def folders(tmp_path_factory):
 
 
 def detector(folder, **changes):
-    return RtDetrDetector(settings(detector_path=str(folder), **changes))
+    return ClosedSetDetector(settings(detector_path=str(folder), **changes))
 
 
 @pytest.fixture
@@ -88,25 +88,51 @@ def test_all_detections_equal_the_queries_of_the_network(folders, version):
     assert np.ptp(found.scores) > 0.05 and np.ptp(found.boxes_xyxy[:, 0]) > 5
 
 
-def test_a_d_fine_equals_the_post_processing_of_transformers(tmp_path):
-    rgb, model = image(48, 96), models.save_dfine(tmp_path)
+PROCESSORS = {
+    "d_fine": "RTDetr",
+    "detr": "Detr",
+    "yolos": "Yolos",
+    "deformable_detr": "DeformableDetr",
+}
+
+
+@pytest.mark.parametrize("family", ["d_fine", "detr", "yolos", "deformable_detr", "rf_detr"])
+def test_a_detector_equals_the_post_processing_of_transformers(tmp_path, family):
+    rgb, is_dfine = image(48, 96), family == "d_fine"
+    model = models.save_dfine(tmp_path) if is_dfine else models.save_closed_set(tmp_path, family)
+    size = (64, 64) if family in ("d_fine", "rf_detr") else (50, 100)
     pixels = torch.from_numpy(rgb.astype(np.float32) / 255).permute(2, 0, 1)[None]
     pixels = torch.nn.functional.interpolate(
-        pixels, size=(64, 64), mode="bilinear", antialias=True, align_corners=False
+        pixels, size=size, mode="bilinear", antialias=True, align_corners=False
     )
+    if not is_dfine:
+        mean, std = (torch.tensor(models.IMAGENET[key])[:, None, None] for key in models.IMAGENET)
+        pixels = (pixels - mean) / std
     with torch.no_grad():
         output = model(pixels)
-    # It lists a query once for each class, and as many as there are queries.
-    least = float(output.logits.sigmoid().flatten().sort(descending=True).values[QUERIES - 1])
-    process = transformers.RTDetrImageProcessorPil().post_process_object_detection
-    (expected,) = process(output, threshold=least - 1e-6, target_sizes=[(48, 96)])
-    best: dict[tuple, float] = {}
-    for box, score in zip(expected["boxes"].tolist(), expected["scores"].tolist()):
-        best.setdefault(tuple(box), score)
-    found = detector(tmp_path).detect(rgb, least - 1e-6)
-    assert 3 < len(found) == len(best)
-    assert np.allclose(found.scores, list(best.values()), atol=1e-4)
-    assert np.allclose(found.boxes_xyxy + 0.5, list(best), atol=1e-3)
+    queries, least = output.logits.shape[1], 1e-6
+    if family not in ("detr", "yolos"):
+        # It lists a query once for each class, and as many as there are queries.
+        least = float(output.logits.sigmoid().flatten().sort(descending=True).values[queries - 1])
+    processor = f"{PROCESSORS.get(family, 'DeformableDetr')}ImageProcessorPil"
+    process = getattr(transformers, processor)().post_process_object_detection
+    options = {"top_k": queries} if "Deformable" in processor else {}
+    (expected,) = process(output, threshold=least - 1e-6, target_sizes=[(48, 96)], **options)
+    best: dict[tuple, tuple] = {}
+    for box, score, label in zip(
+        *(expected[key].tolist() for key in ("boxes", "scores", "labels"))
+    ):
+        best[tuple(box)] = max(best.get(tuple(box), (0.0, 0)), (score, label))
+    ranked = sorted(best.items(), key=lambda item: -item[1][0])
+    made = detector(tmp_path)
+    found = made.detect(rgb, least - 1e-6)
+    assert made.classes == CLASSES and 3 < len(found) == len(ranked)
+    labels = [label - (not is_dfine) for _, (_, label) in ranked]
+    assert found.class_probabilities.argmax(axis=1).tolist() == labels
+    assert np.allclose(found.class_probabilities.sum(axis=1), 1)
+    assert np.ptp(found.scores) > 1e-3  # the spread that makes this a test
+    assert np.allclose(found.scores, [score for _, (score, _) in ranked], atol=1e-4)
+    assert np.allclose(found.boxes_xyxy + 0.5, [box for box, _ in ranked], atol=1e-3)
 
 
 def test_softmax_scores_are_the_distributions_maxima(folders):
@@ -243,9 +269,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(folders, tmp_path, monkeypatc
     refused("detector_path is empty", detector, "")
     refused("no such folder", detector, "/no/such/folder")
     refused("hf download nobody/nothing", detector, "nobody/nothing")
-    refused(
-        "sam: expected d_fine or rt_detr or rt_detr_v2", detector, models.save_sam(tmp_path / "sam")
-    )
+    refused("sam: expected conditional_detr or d_fine", detector, models.save_sam(tmp_path / "sam"))
     nameless = models.save_rtdetr(tmp_path / "a", labels=[f"LABEL_{i}" for i in range(3)])
     refused("does not name its 3 classes", detector, nameless)
     short = models.save_rtdetr(tmp_path / "b", card=CheckpointCard(classes=("bed",)))
@@ -256,7 +280,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(folders, tmp_path, monkeypatc
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     refused("perception.device is 'cuda'", detector, folders["v1"], device="cuda")
-    monkeypatch.setattr(RtDetrDetector, "_forward", full)
+    monkeypatch.setattr(ClosedSetDetector, "_forward", full)
     refused("out of memory .* smaller perception.detector_p", detector, folders["v1"])
 
 
