@@ -30,7 +30,8 @@ OUTLIERS = 0.4
 OTHERS = 0.05
 
 # The part of a node's record that belongs to its name: the labels (-1 = none), the probability
-# of each class (row) with each name (column), and the place of the viewpoint of the name.
+# of each class (row) with each name (column), and the place of the viewpoint that says it (-1 =
+# none: the camera has come back to another one).
 NAME_FIELDS: list[Any] = [
     ("labels", np.int64, LABELS),
     ("joint", np.float64, (LABELS, LABELS)),
@@ -77,6 +78,8 @@ def observe_names(
         if is_new or place == record.named_from:
             _name(record, seen[index], is_new)
             record.named_from = place
+        else:
+            record.named_from = -1
         classes[index] = OTHERS / seen.shape[1]
         for i in range(LABELS):
             if record.labels[i] >= 0:
@@ -154,6 +157,9 @@ VIEW_COS = math.cos(VIEW_RAD)
 VIEW_RATIO = 1.2
 # Viewpoints of a node that are remembered. Of more, the oldest one counts for good.
 VIEWS = 12
+# Frames of a viewpoint that count, two seconds of video: of more, the older half counts half. A
+# camera that stands still may see more than before, when the light changes or a person has gone.
+VIEW_FRAMES = 60.0
 # Beyond the largest distance of a detection, by this factor, a miss is not counted.
 REACH_FACTOR = 1.1
 # The rates start as if this many viewpoints had been observed, and half of them had detected the
@@ -294,6 +300,9 @@ def observe_existence(
             record.view_detected[place] = 0.0
             record.view_visibility[place] = record.view_named[place] = 0
         record.current = place
+        if record.view_shown[place] >= VIEW_FRAMES:
+            record.view_shown[place] *= 0.5
+            record.view_detected[place] *= 0.5
         record.view_shown[place] += 1.0
         best = max(np.int64(record.view_visibility[place]), visibilities[index])
         record.view_visibility[place] = best

@@ -60,9 +60,9 @@ def check_memory(memory: Arrays, record: np.dtype[np.void], class_count: int) ->
     # The rate of detections is below one: its logarithm is taken.
     holds("looks", (looks[:, 1] < looks[:, 0]).all(), "fewer detections than looks")
     within("fates", checked(memory, "fates", np.int64, 2), 1, 2**52)
-    frames = int(checked(memory, "frames", np.int64))
-    within("frames", np.array([frames]), 0, 2**52)
-    within("records (last_frame)", records["last_frame"], 0, frames)
+    frames = checked(memory, "frames", np.int64)
+    within("frames", frames, 0, 2**52)
+    within("records (last_frame)", records["last_frame"], 0, frames.item())
     poses = checked(memory, "recent_poses", np.float64, None, 4, 4)
     holds("recent_poses", len(poses) <= RECENT_FRAMES, f"at most {RECENT_FRAMES}")
     within("recent_poses", poses, -MAX_SUM, MAX_SUM)
@@ -97,8 +97,8 @@ def _check_existence(records: NDArray[np.void]) -> None:
     within("records (views)", records["views"], 0, 2**52)
     within("records (view_camera)", records["view_camera"], -MAX_SUM, MAX_SUM)
     within("records (view_visibility)", records["view_visibility"], 0, len(VISIBILITIES) - 1)
-    for name in ("named_from", "current"):
-        within(f"records ({name})", records[name], 0, beliefs.VIEWS - 1)
+    within("records (named_from)", records["named_from"], -1, beliefs.VIEWS - 1)
+    within("records (current)", records["current"], 0, beliefs.VIEWS - 1)
     within("records (view_named)", records["view_named"], 0, 1)
     detected, shown = records["view_detected"], records["view_shown"]
     holds("records (view_detected)", (detected <= shown).all(), "no more than view_shown")
