@@ -7,6 +7,7 @@ import logging
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -124,13 +125,13 @@ def _write_network(detector: ClosedSetDetector, path: str, network: Path) -> Non
     """Write a network in float32, without the outputs that nobody reads."""
     import onnx_ir
     from onnx_ir.passes.common import RemoveUnusedNodesPass
-    from transformers.exporters import OnnxConfig, OnnxExporter
 
+    exporters: Any = import_module("transformers.exporters")
     pixels = detector.preprocess(_noise(detector), detector.device, detector.dtype)
     try:
         program: Any = (
-            OnnxExporter()
-            .export(detector.model, {INPUT: pixels}, config=OnnxConfig(dynamic=False))
+            exporters.OnnxExporter()
+            .export(detector.model, {INPUT: pixels}, config=exporters.OnnxConfig(dynamic=False))
             .program
         )
         kept = [value for value in program.graph.outputs if value.name in OUTPUTS]
