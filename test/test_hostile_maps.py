@@ -114,7 +114,7 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
         "successors": np.array([[10, 10]]),
     },
     "a label beyond the classes": field("labels", (0, 0), 4),
-    "a visibility beyond the table": field("visibility", 0, 9),
+    "a visibility beyond the table": field("view_visibility", 0, 9),
     # Each of these was believed.
     "a mean of NaN": changed("means", put((0, 0), np.nan)),
     "an infinite mean": changed("means", put((1, 2), np.inf)),
@@ -153,7 +153,7 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
     "a record with a score of NaN": field("best_score", 0, np.nan),
     "a record without a name": field("labels", 0, -1),
     "a record whose name has no probability": field("joint", 0, 0.0),
-    "more detections than frames": field("detected", 0, 1e6),
+    "more detections than frames": field("view_detected", 0, 1e6),
     "looks that are all detections": changed("merging.looks", lambda a: a * 0 + 5.0),
     "no fates": changed("merging.fates", lambda a: a * 0),
     "a block twice": changed("merging.blocks", lambda a: a * 0 + a[0]),

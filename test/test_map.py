@@ -147,7 +147,8 @@ def test_a_map_of_an_older_release_has_no_up_direction_and_may_have_no_votes(tmp
 def test_hidden_nodes_are_dropped_and_ids_and_priors_continue(tmp_path):
     frames = [frame(stamp, (WHOLE, TABLE)) for stamp in range(1, 5)]
     builder = builder_of(*frames, config=Config())
-    assert builder.integrate(frame(5, (WHOLE, TABLE), (MUG, CUP))) == [1, 2]
+    unsure = np.array([0.9, 0.2])
+    assert builder.integrate(frame(5, (WHOLE, TABLE), (MUG, CUP), scores=unsure)) == [1, 2]
     pair, prediction = np.array([[CUP, TABLE]]), np.array([[0.7, 0.2, 0.1]])
     builder.prior.update(pair, prediction)
     again = read_map(Config(), saved(builder, tmp_path))

@@ -339,7 +339,7 @@ def probabilities(
         first = max(0, record.views - VIEWS)
         for view in range(first, record.views):
             more, less = _view(record, counts, view % VIEWS)
-            found += more
+            found += more if with_misses else math.ceil(more)
             missed += less
             since = 0.0 if more > 0.0 else since + less
             detecting += more > 0.0

@@ -62,7 +62,7 @@ def check_memory(memory: Arrays, record: np.dtype[np.void], class_count: int) ->
     within("fates", checked(memory, "fates", np.int64, 2), 1, 2**52)
     frames = checked(memory, "frames", np.int64)
     within("frames", frames, 0, 2**52)
-    within("records (last_frame)", records["last_frame"], 0, frames.item())
+    within("records (last_frame)", records["last_frame"], 0, 2**52)
     poses = checked(memory, "recent_poses", np.float64, None, 4, 4)
     holds("recent_poses", len(poses) <= RECENT_FRAMES, f"at most {RECENT_FRAMES}")
     within("recent_poses", poses, -MAX_SUM, MAX_SUM)

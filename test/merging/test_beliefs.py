@@ -81,7 +81,7 @@ def test_one_frame_of_many_is_not_enough() -> None:
     walk.miss(5, step_m=0.0)
     walk.see(step_m=0.0)
     assert walk.published == [] and 0.0 < walk.existence < 0.5
-    assert walk.hidden == {1: "seen too little"}
+    assert walk.hidden == {1: "missed by the detector"}
     walk.see(5)
     assert walk.published == [1] and walk.hidden == {}
 
@@ -113,7 +113,7 @@ def test_a_node_missed_from_most_positions_is_hidden_until_it_is_detected_again(
     walk = Walk()
     walk.see(12, score=0.4)
     assert walk.published == [1]
-    walk.miss(600)
+    walk.miss(90)
     assert walk.published == [] and list(walk.graph.nodes.slot_of) == [1]
     assert walk.hidden == {1: "missed by the detector"}
     walk.see(100, score=0.4)

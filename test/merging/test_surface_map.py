@@ -324,7 +324,7 @@ def test_a_map_continues_the_evidence(tmp_path: Path) -> None:
             np.testing.assert_array_equal(one.surface_counts, other.surface_counts)
     # A map of an older release starts without evidence.
     arrays = graph_files.read(path)
-    for name in ("scores", "records", "looks", "fates", "last_ns"):
+    for name in ("scores", "records", "looks", "fates", "frames"):
         del arrays[f"merging.{name}"]
     del arrays["existence"]
     graph_files.write(path, arrays)
