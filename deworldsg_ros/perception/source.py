@@ -13,6 +13,7 @@ import numpy as np
 from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.scene.arrays import Float64, UInt8, pairwise_iou
 from deworldsg_ros.scene.camera import SentDetections
+from deworldsg_ros.scene.checks import MAX_SUM_ERROR
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.vocabulary import plain
 
@@ -137,6 +138,8 @@ class DetectionSource:
         for name, score in scores.items():
             result[name] = score
         total = result.sum()
+        if abs(total - 1.0) <= MAX_SUM_ERROR:  # as it is, to the last bit
+            return result
         if total >= FULL:
             return result / total
         again = self._said[best] + OTHERS / len(self._classes)
