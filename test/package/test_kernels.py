@@ -124,3 +124,26 @@ def test_a_kernel_is_compiled_again_if_one_that_it_calls_in_another_file_changed
     assert call(1, "One.") == ["4", "False"]
     assert call(1, "Another text, and\n    another line.") == ["4", "False"]
     assert call(5, "One.") == ["12", "True"]
+
+
+OF_A_RELEASE = """
+from typing import NamedTuple
+from deworldsg_ros.base.kernels import kernel
+class {name}(NamedTuple):
+    x: float
+@kernel
+def doubled(item):
+    return {factor} * item.x
+print(doubled({name}(2.0)))
+"""
+
+
+def test_what_another_release_has_compiled_does_not_end_the_program(tmp_path):
+    """The types of its kernels may be no more."""
+    for name, factor, result in (("Frame", 2, "4.0"), ("View", 3, "6.0"), ("Frame", 2, "4.0")):
+        text = OF_A_RELEASE.format(name=name, factor=factor)
+        (tmp_path / "release.py").write_text(text, encoding="utf-8")
+        code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import release"
+        command = [sys.executable, "-B", "-c", code]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.stdout.split() == [result], done.stderr
