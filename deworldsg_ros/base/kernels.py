@@ -179,8 +179,8 @@ def _cache_class() -> Any:
             return self._content
 
         def get_disambiguator(self) -> str:
-            # Part of the names of the files: numba unpickles a file before it looks whether it is of
-            # this kernel, and another version of the package may have types that are no more.
+            # Part of the names of the files: numba unpickles a file before it looks whether it is
+            # of this kernel, and another release may have types that are no more.
             return self._content.hex()[:16]
 
         def __getattr__(self, name: str) -> Any:  # the place of the files

@@ -25,14 +25,24 @@ from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 #     time      = number [ "s" ] [ "ago" ]     a stamp in seconds, or seconds before the graph's
 #     stamp
 #
-# Articles and words such as "which", "where", "there" are skipped.
+# Articles and words such as "which", "where", "there", "could you tell me" are skipped, and so is a
+# last "in the room" or "here".
 
 SKIPPED = frozenset(
     {
         *("a", "an", "the", "is", "are", "was", "which", "where", "find", "show", "all", "that"),
         *("there", "any", "me", "please", "do", "you", "i", "see", "can", "it", "one", "does"),
+        *("could", "would", "tell", "know", "we", "us", "have", "got", "did", "leave", "put"),
+        *("my", "our", "your", "this", "hey", "robot"),
     }
 )
+CONTRACTIONS = {
+    **{f"{word}{s}": f"{word} is" for word in ("what", "where", "there") for s in ("'s", "s")},
+    **{f"{word}{nt}": f"{word} not" for word in ("is", "are") for nt in ("n't", "nt")},
+}
+PLACES = frozenset({"room", "here", "view", "scene"})
+# What people say for near.
+NEAR_WORDS = frozenset({"next to", "beside", "close by", "close to", "around", "by"})
 ANYTHING = frozenset(
     {
         "anything",
@@ -164,7 +174,9 @@ def parse(question: str, predicates: Collection[str] = ()) -> Pattern | Since | 
         raise ClientError(
             f"question of {len(question)} characters: expected at most {MAX_QUESTION}"
         )
-    tokens = _TOKEN.findall(question.strip().rstrip(" ?.!").lower())
+    text = question.strip().rstrip(" ?.!").lower().replace("’", "'")
+    words = [CONTRACTIONS.get(word, word) for word in text.split()]
+    tokens = _TOKEN.findall(" ".join(words))
     if tokens[:2] == ["what", "changed"]:
         return _since(question, tokens[2:])
     if tokens[:1] == ["like"]:
@@ -175,6 +187,8 @@ def parse(question: str, predicates: Collection[str] = ()) -> Pattern | Since | 
     elif tokens[:1] in (["is"], ["are"]):
         kind = "holds" if tokens[1:2] == ["the"] else "exists"
     tokens = [token for token in tokens if token not in SKIPPED]
+    if len(tokens) > 1 and tokens[-1] in PLACES:
+        tokens = tokens[: -2 if tokens[-2] == "in" else -1]
     if tokens[:2] in (["what", "colour"], ["what", "color"]):
         kind, tokens = "colour", tokens[3:] if tokens[2:3] == ["of"] else tokens[2:]
     return _Reader(question, tokens, _longest_first(predicates)).pattern(kind)
@@ -194,7 +208,9 @@ class _Reader:
         ranks = [] if rank is None else [self._rank(rank)]
         conditions = [] if colour is None else [Condition(own_colour=colour)]
         while self.tokens:
-            if self.tokens[0] in RANKS:
+            if thing is None and self.tokens[0] in ANYTHING:  # "what is the largest thing"
+                self.tokens.pop(0)
+            elif self.tokens[0] in RANKS:
                 ranks.append(self._rank(self.tokens.pop(0)))
             else:
                 conditions.append(self.condition())
@@ -257,6 +273,8 @@ class _Reader:
         if self.tokens[:1] == ["within"]:
             return self._within(None, None)
         predicate = self._predicate()
+        if predicate in NEAR_WORDS:
+            predicate = "near"
         if predicate is None:
             raise ClientError(
                 f"question '{self.question}': '{' '.join(self.tokens) or 'the end'}' is no "
@@ -323,6 +341,7 @@ class _Reader:
 
 def _longest_first(predicates: Iterable[str]) -> list[list[str]]:
     names = {plain(name) for group in PREDICATES for name in group} | set(map(plain, predicates))
+    names |= NEAR_WORDS
     return sorted((name.split() for name in names if name), key=lambda n: (-len(n), n))
 
 

@@ -23,6 +23,8 @@ from deworldsg_ros.scene.errors import ClientError
 
 # Answers that are less probable are left out.
 MIN_PROBABILITY = 0.05
+# The opposite of "on".
+UNDER = frozenset({"under", "below"})
 
 
 @dataclass(frozen=True)
@@ -367,6 +369,8 @@ def _best_part(
         around = graph.objects(near=item, within=condition.within_m or 0.0)
     else:
         around = [found.object for found in graph.relations(item, condition.predicate)]
+        if condition.predicate in UNDER:  # the table is under the cup that is on it
+            around += [found.subject for found in graph.relations(None, "on", item)]
     around = [other for other in dict.fromkeys(around) if other.id != item.id]
     others = _things(around, condition.thing, condition.colour)
     parts = [
@@ -398,8 +402,11 @@ def _part(
     if condition.predicate is None:
         return counted_chance, None, f"{distance_m(item, other):.2f} m from {of}"
     found = graph.relations(item, condition.predicate, other)
+    if not found and condition.predicate in UNDER:
+        found = graph.relations(other, "on", item)
     if not found:
         return None
     relation = found[0]
-    text = f"{relation.predicate} {of}: {relation.probability:.0%}, {relation.evidence}"
+    said = relation.predicate if relation.subject.id == item.id else condition.predicate
+    text = f"{said} {of}: {relation.probability:.0%}, {relation.evidence}"
     return counted_chance * relation.probability, relation, text

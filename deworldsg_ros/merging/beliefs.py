@@ -19,12 +19,12 @@ from deworldsg_ros.scene.arrays import Float64, Int64
 # it has at present. At a new viewpoint the name is drawn again with probability DRAWN: it is the
 # class, or another label with probability WRONG. A frame shows the name, or any label with
 # probability OUTLIERS. A viewpoint that the camera comes back to has said its name. Only the LABELS
-# most probable labels count. The constants gave the most relations with faults of all kinds in one
-# room, and no fewer with the detector (tools/merging_lab).
+# most probable labels count. The constants gave the best calibration of names over known detections
+# with and without faults, and about as many relations (tools/merging_lab).
 
 LABELS = 8
-DRAWN = 0.25
-WRONG = 0.4
+DRAWN = 0.5
+WRONG = 0.2
 OUTLIERS = 0.4
 # Probability of all other labels together.
 OTHERS = 0.05
