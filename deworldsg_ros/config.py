@@ -90,7 +90,11 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = ""
     words: Annotated[
         tuple[Word, ...],
-        option("what the detector open_vocabulary looks for", max_length=MAX_WORDS),
+        option(
+            "what the detector open_vocabulary looks for; with the detector topic, names of the "
+            "classes that it sends as numbers, from 0",
+            max_length=MAX_WORDS,
+        ),
     ] = ()
     segmenter_path: Annotated[
         str, option("checkpoint of sam2, sam3 or sam: a folder, or a hub id in the local cache")

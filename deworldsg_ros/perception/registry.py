@@ -53,7 +53,7 @@ def _onnx(config: PerceptionConfig) -> Detector:
 def _topic(config: PerceptionConfig) -> Detector:
     from deworldsg_ros.perception.source import DetectionSource
 
-    return DetectionSource()
+    return DetectionSource(config.words)
 
 
 def _rgbd(config: PerceptionConfig) -> Segmenter:

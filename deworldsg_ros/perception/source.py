@@ -7,6 +7,7 @@ detector itself: it names an object again in the next image, and sometimes in an
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -35,11 +36,16 @@ FULL = 0.999
 
 
 class DetectionSource:
-    """A detector whose results arrive with the image."""
+    """A detector whose results arrive with the image.
+
+    Args:
+        words: names of the classes that the source sends as numbers, from 0; see `use_words`.
+    """
 
     default_score_threshold = SCORE_THRESHOLD
 
-    def __init__(self) -> None:
+    def __init__(self, words: Sequence[str] = ()) -> None:
+        self._words = tuple(words)
         self._drops: Counter[str] = Counter()
         self._index: dict[str, int] = {}
         self._classes: tuple[str, ...] = ()
@@ -52,6 +58,21 @@ class DetectionSource:
     def classes(self) -> tuple[str, ...]:
         """The names so far, in lower case."""
         return self._classes
+
+    def check_words(self, words: Sequence[str]) -> None:
+        """Any words may be names of numbers."""
+
+    def use_words(self, words: Sequence[str], before: Sequence[str] = ()) -> None:
+        """Use other names for the classes that the source sends as numbers, from 0.
+
+        Args:
+            words: all of them; a number beyond is a name itself.
+            before: classes that keep their columns: those of another source, which this replaces.
+        """
+        self._words = tuple(words)
+        for name in before:
+            self._index.setdefault(name, len(self._index))
+        self._classes = tuple(self._index)
 
     def detect(self, rgb: UInt8, score_threshold: float) -> Detections:
         """The results come with the image: there is nothing to detect.
@@ -103,7 +124,8 @@ class DetectionSource:
         """Scores by index of the names; without names that are too many."""
         found: dict[int, float] = {}
         for text, score in zip(names, scores):
-            name = plain(text).strip()
+            number = int(text) if text.isdecimal() and len(text) < 6 else len(self._words)
+            name = plain(self._words[number] if number < len(self._words) else text).strip()
             if name not in self._index:
                 if not name or len(self._index) >= MAX_SOURCE_NAMES:
                     continue

@@ -30,6 +30,14 @@ def test_names_are_learned_in_lower_case_and_stay_in_order():
     assert take(source, (HERE, {"mug": 0.3}), threshold=0.4).classes == source.classes
 
 
+def test_numbers_of_classes_have_names():
+    source = DetectionSource(["person", "Red_Mug"])
+    found = take(source, (HERE, {"1": 0.6}), (THERE, {"2": 0.5}))
+    assert found.classes == ("red mug", "2")
+    source.use_words(["a", "b", "c"], before=("desk",))
+    assert take(source, (HERE, {"2": 0.6})).classes == ("red mug", "2", "desk", "c")
+
+
 def test_scores_that_sum_to_one_are_the_distribution():
     found = take(DetectionSource(), (HERE, {"cup": 0.25, "mug": 0.7, "bowl": 0.05}))
     assert found.class_probabilities.tolist() == [[0.25, 0.7, 0.05]]
