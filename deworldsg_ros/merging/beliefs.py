@@ -129,7 +129,7 @@ def _name(record: Any, seen: Float64, is_new: bool) -> None:
 # to the camera within VIEW_RAD, and a distance within a factor of VIEW_RATIO. It detects the node
 # by the fraction of its frames that do; frames in which the node is hidden do not count.
 #
-# The log odds of existence are a sum:
+# The log odds of existence are a sum, times SLOPE, which calibrates them:
 #
 #     prior + SCORE ln(s / (1 - s)) + LOOKS ln(D) - MISSES ln(1 + M) - MOMENT ln(1 + R)
 #
@@ -145,6 +145,7 @@ def _name(record: Any, seen: Float64, is_new: bool) -> None:
 # viewpoint belong to this viewpoint, too.
 
 OFFSET, SCORE, LOOKS, MISSES, MOMENT = 0.2, 1.5, 1.2, 0.35, 1.2
+SLOPE = 1.5
 MOMENT_VIEWS = 2
 FATES = 0.4
 # The fate of a node is known from this probability on, or below one minus it after a clear miss.
@@ -350,7 +351,7 @@ def probabilities(
             log_odds -= MISSES * math.log1p(missed)
             if detecting <= MOMENT_VIEWS:
                 log_odds -= MOMENT * math.log1p(since)
-        result[index] = 1.0 / (1.0 + math.exp(-log_odds))
+        result[index] = 1.0 / (1.0 + math.exp(-SLOPE * log_odds))
     return result
 
 

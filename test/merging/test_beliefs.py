@@ -243,7 +243,7 @@ def log_odds(views: dict[int, list[tuple[float, int]]], rate: float) -> float:
     )
     if detecting <= beliefs.MOMENT_VIEWS:
         result -= beliefs.MOMENT * math.log(1 + since)
-    return result
+    return beliefs.SLOPE * result
 
 
 @pytest.mark.parametrize("seed", range(20))
