@@ -47,7 +47,8 @@ def start(record: Any, probabilities: Float64) -> None:
     np.fill_diagonal(drawn, 1.0 - WRONG)
     record["labels"], record["joint"], record["named_from"] = -1, 0.0, 0
     record["labels"][:count] = order
-    record["joint"][:count, :count] = drawn * probabilities[order]
+    joint = drawn * probabilities[order]
+    record["joint"][:count, :count] = joint / joint.sum()
 
 
 @kernel

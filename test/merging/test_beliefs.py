@@ -330,6 +330,18 @@ def test_the_filter_is_that_of_the_definition(seed: int) -> None:
     np.testing.assert_allclose(named(frames, 3), filtered(frames, 3), rtol=1e-9)
 
 
+def test_a_node_of_many_labels_that_is_seen_again_has_a_distribution() -> None:
+    """A new record considers some labels only, and a viewpoint that has spoken says nothing."""
+    records, slots = records_of(1), np.array([0])
+    look(records, 0, 0, 0.9)
+    look(records, 0, 1, 0.9)
+    beliefs.start(records.rows[0], np.full(COUNT, 1 / COUNT))
+    seen = np.full((1, COUNT), 1 / COUNT)
+    for position in (1, 0):
+        classes = records.name(slots, seen, np.zeros((1, 3)), camera_at(position))
+        assert classes.sum() == pytest.approx(1.0)
+
+
 def test_a_viewpoint_says_its_name_once() -> None:
     """The camera goes to and fro between two of three viewpoints."""
     seen = [frame[None] for frame in frames_of([3, 3, 5])]
