@@ -343,11 +343,25 @@ class SceneGraph:
                 unknown = " ".join(words[: -len(known.split())])
                 raise ClientError(f"'{visible(unknown)}' is not understood; '{visible(known)}' is")
         alike = near_names(" ".join(words), self._known)
+        akin = self._akin(" ".join(words))
         raise ClientError(
             f"'{visible(name[:MOST_SHOWN])}' is the name of no class; "
             + (f"spelt alike: {visible(', '.join(alike))}; " if alike else "")
+            + (f"closest in meaning: {visible(', '.join(akin))}; " if akin else "")
             + f"classes of the graph: {visible(', '.join(self.labels)) or 'none'}"
         )
+
+    def _akin(self, name: str) -> list[str]:
+        """Classes of the closest meaning, if the embeddings are of a model that is here."""
+        if self.looks is None or not name.strip():
+            return []
+        try:
+            meant, *known = (embed_text(self.looks.model, text) for text in (name, *self.labels))
+        except ClientError:
+            return []
+        cosines = [float(meant @ one / np.linalg.norm(one)) for one in known]
+        best = sorted(zip(cosines, self.labels), reverse=True)
+        return [label for _, label in best[:2]]
 
     def _understand(self, name: str) -> Understood | None:
         plain_name = " ".join(words_of(name))

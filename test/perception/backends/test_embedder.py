@@ -70,6 +70,12 @@ def test_texts_find_the_objects_that_look_like_them(tmp_path, family, room):
     answers = ask(graph, 'like "sofa"')
     assert [answer.item.id for answer in answers.found] == [39, 13]
     assert "cosine 1.000" in answers.found[0].evidence and str(tmp_path) in answers.notes[0]
+    drink = unit(embed_text(str(tmp_path), "drink"))
+    best = max(graph.labels, key=lambda name: drink @ unit(embed_text(str(tmp_path), name)))
+    with pytest.raises(
+        ClientError, match=f"'drink' is the name of no .*closest in meaning: {best}"
+    ):
+        graph.understand("drink")
 
 
 def test_models_that_cannot_be_used_are_named(tmp_path, room):
