@@ -138,7 +138,8 @@ class DetectionSource:
     def _compare(self, boxes: Float64, best: list[int]) -> None:
         """Count how the source names again what the image before showed."""
         more = len(self._classes) - len(self._said)
-        self._said = np.pad(self._said, (0, more))
+        if more:
+            self._said = np.pad(self._said, (0, more))
         boxes_before, names_before = self._before
         self._before = boxes, best
         if not len(boxes) or not len(boxes_before):
