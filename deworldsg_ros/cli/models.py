@@ -210,7 +210,7 @@ def _measure(name: str, recording: Path, into: Path, words: tuple[str, ...]) -> 
     return replace(done, found=(found.found, found.objects), precision=precision)
 
 
-# Images that tell how large the activations are: from so many frames, every so manieth.
+# To find the range of the activations: at most 64 images, every tenth frame of the recording.
 CALIBRATION_IMAGES, CALIBRATION_STEP = 64, 10
 
 

@@ -115,7 +115,7 @@ class NodeEmbeddings:
         model: name of the model of all of them; "" = there are none yet.
         size: D; 0 = there are none yet.
         views: of each node; read only.
-        changed: ids whose embedding has changed or gone; whoever publishes empties it.
+        changed: ids whose embedding has changed or gone; the publisher empties the set.
     """
 
     def __init__(self) -> None:

@@ -196,7 +196,7 @@ EXISTENCE_FIELDS: list[Any] = [
 
 
 def first_counts() -> Float64:
-    """Viewpoints at objects, and those that detected them, by visibility: (.., 2)."""
+    """Viewpoints at objects, and those that detected them: (len(VISIBILITIES), 2)."""
     return np.full((len(VISIBILITIES), 2), (PRIOR_LOOKS, PRIOR_LOOKS / 2))
 
 
@@ -213,7 +213,7 @@ def prior(fates: Int64) -> float:
 def settle(records: NDArray[Any], fates: Int64, slots: Int64, known: Float64) -> None:
     """Count the nodes that have turned out to be objects, or errors, by probabilities (n,).
 
-    A node is an error only after a clear miss. A new node is improbable, too, if frames come fast.
+    A node is an error only after a clear miss: a new node is improbable, too.
     """
     is_error = (known < 1.0 - SETTLED) & (records["missed"][slots] > CLEAR_MISS)
     is_new = ~records["is_settled"][slots] & ((known > SETTLED) | is_error)

@@ -157,7 +157,7 @@ class NodeRecords:
 
     Attributes:
         rows: (n,) of `RECORD`, by slot; ``node_id`` is 0 where there is no record.
-        looks: looks at objects and those that detected them (`beliefs.first_counts`).
+        looks: viewpoints at objects and those that detected them (`beliefs.first_counts`).
         fates: errors and objects among the nodes so far (`beliefs.first_fates`).
         frames: number of frames so far.
         map: cells of the surfaces, by slot.

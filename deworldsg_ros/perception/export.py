@@ -122,7 +122,7 @@ def _card(detector: ClosedSetDetector) -> OnnxCard:
 
 
 def _write_network(detector: ClosedSetDetector, path: str, network: Path) -> None:
-    """Write a network in float32, without the outputs that nobody reads."""
+    """Write a network in float32, with the outputs `OUTPUTS` only."""
     import onnx_ir
     from onnx_ir.passes.common import RemoveUnusedNodesPass
 

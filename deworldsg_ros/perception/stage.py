@@ -229,7 +229,7 @@ def instance_image(
 
 # --- The colour of each object.
 
-# Pixels of the patch around an object of which the colours are taken, evenly spaced: about as many.
+# The colour of an object comes from about this many pixels of the patch around it, evenly spaced.
 COLOUR_SAMPLES = 200
 # Factors and offsets from the 8-bit CIELAB of OpenCV.
 LAB_SCALE, LAB_OFFSET = np.array([100.0 / 255.0, 1.0, 1.0]), np.array([0.0, 128.0, 128.0])
@@ -274,7 +274,7 @@ def mean_colours(
 
 # --- Which objects are embedded: a few a second, each after another while.
 
-# Objects of which a vector is computed in a second of the frames' time; as many at once at most.
+# Objects that are embedded in each second, by the stamps of the frames; also the most in one frame.
 EMBEDDED_PER_S = 2.0
 # Objects that are remembered as embedded.
 MOST_EMBEDDED = 64

@@ -237,7 +237,7 @@ def combine(
         class_scores: (k, C) sigmoid scores.
         score_threshold: minimum score of an object.
         calibration: scores (n, C) to distributions.
-        masks: k masks, of which the objects keep theirs; None = none.
+        masks: one mask for each candidate; None = the detector has no masks.
     """
     best = class_scores.max(axis=1) if len(class_scores) else np.zeros(0)
     # A box never suppresses a better one.
