@@ -72,7 +72,7 @@ def observe_names(
     """
     for index in range(len(slots)):
         record = records[slots[index]]
-        place = viewpoint(record, means_world[index], camera_world)
+        place = viewpoint(record.view_camera[: record.views], means_world[index], camera_world)
         is_new = place < 0 or record.view_named[place] == 0
         if place < 0:
             place = record.views % VIEWS  # where `observe_existence` puts it
@@ -221,24 +221,16 @@ def settle(records: NDArray[Any], fates: Int64, slots: Int64, known: Float64) ->
     fates += np.bincount(~is_error[is_new], minlength=2)
 
 
-def is_same_view(mean: Float64, camera: Float64, other: Float64) -> bool:
-    """Whether two camera positions (3,) are one viewpoint of a node with this mean, metres."""
-    a, b = camera - mean, other - mean
-    length_a, length_b = math.sqrt(a @ a) + 1e-9, math.sqrt(b @ b) + 1e-9
-    near = length_a < VIEW_RATIO * length_b and length_b < VIEW_RATIO * length_a
-    return bool(near and a @ b > VIEW_COS * length_a * length_b)
-
-
 @kernel
-def viewpoint(record: Any, mean: Float64, camera: Float64) -> int:
-    """The place of the viewpoint of a camera position; -1 = none of those remembered."""
+def viewpoint(cameras: Any, mean: Float64, camera: Float64) -> int:
+    """The nearest viewpoint (k, 3) of a node that a camera position shares; -1 = none."""
     x, y, z = camera[0] - mean[0], camera[1] - mean[1], camera[2] - mean[2]
     distance = math.sqrt(x * x + y * y + z * z) + 1e-9
     best, place = VIEW_COS, -1
-    for index in range(min(record.views, VIEWS)):
-        a = record.view_camera[index, 0] - mean[0]
-        b = record.view_camera[index, 1] - mean[1]
-        c = record.view_camera[index, 2] - mean[2]
+    for index in range(len(cameras)):
+        a = cameras[index, 0] - mean[0]
+        b = cameras[index, 1] - mean[1]
+        c = cameras[index, 2] - mean[2]
         other = math.sqrt(a * a + b * b + c * c) + 1e-9
         cosine = (x * a + y * b + z * c) / (distance * other)
         near = distance < VIEW_RATIO * other and other < VIEW_RATIO * distance
@@ -276,7 +268,7 @@ def observe_existence(
         distance_m = math.sqrt(distance_m)
         if scores[index] == 0.0 and distance_m > REACH_FACTOR * record.reach_m:
             continue
-        place = viewpoint(record, means_world[index], camera_world)
+        place = viewpoint(record.view_camera[: record.views], means_world[index], camera_world)
         if place < 0:
             if record.views:
                 # The camera leaves a viewpoint for a new one: learn the rates from it.

@@ -189,7 +189,7 @@ class NodeRecords:
         for T, (fx, fy, cx, cy, width, height) in self.recent:
             x, y, z = T[:3, :3] @ mean_world + T[:3, 3]
             other = -T[:3, :3].T @ T[:3, 3]
-            if not beliefs.is_same_view(mean_world, camera_world, other):
+            if beliefs.viewpoint(other[None], mean_world, camera_world) < 0:
                 break
             u, v = fx * x / max(z, 1e-9) + cx, fy * y / max(z, 1e-9) + cy
             count += z > 0 and 0 <= u < width and 0 <= v < height
