@@ -210,8 +210,8 @@ def _measure(name: str, recording: Path, into: Path, words: tuple[str, ...]) -> 
     return replace(done, found=(found.found, found.objects), precision=precision)
 
 
-# To find the range of the activations: at most 64 images, every tenth frame of the recording.
-CALIBRATION_IMAGES, CALIBRATION_STEP = 64, 10
+# Most images that are read to find the range of the activations.
+CALIBRATION_IMAGES = 64
 
 
 def export_model(
