@@ -61,6 +61,7 @@ class Recording:
                 f"detections: expected {EXPECTED[Role.DETECTIONS]}"
             )
         self.source = source
+        self._with_detections = with_detections
         self.reasons: dict[str, str] = {}
         self._assembler = FrameAssembler(
             # The source has chosen the poses already.
@@ -97,12 +98,15 @@ class Recording:
             Role.DEPTH: self._assembler.add_depth,
             Role.CAMERA_INFO: self._assembler.add_camera_info,
             Role.POSE: self._assembler.add_pose,
-            Role.DETECTIONS: lambda message, _: self._assembler.add_detections(
-                read_detections(message)
-            ),
-            Role.DETECTION_INSTANCES: self._assembler.add_detection_instances,
         }
+        if self._with_detections:
+            add[Role.DETECTIONS] = lambda message, _: self._assembler.add_detections(
+                read_detections(message)
+            )
+            add[Role.DETECTION_INSTANCES] = self._assembler.add_detection_instances
         for item in self.source.messages():
+            if item.role not in add:
+                continue
             add[item.role](item.message, item.stamp_ns)
             yield from self._assembler.pop_ready(None)
         yield from self._assembler.flush()
