@@ -63,6 +63,7 @@ class SurfaceMerging:
             spare.merge(graph, _spare_frame(stamp_ns))
         NodeStates(graph, 1, graph.even_gaussians).refresh()
         spare.hidden(graph)
+        spare._records.frames_before(np.zeros(3), np.zeros(3))
         spare._records.remove(graph.nodes.slot(1))
         graph.merge_nodes(1, 2)
         # Points are dropped only from nodes whose parts belong to others.
