@@ -56,8 +56,10 @@ def explain_object(
     if not item.is_sure:
         lines.append(f"not sure: it is a {item.label} with {item.probability:.0%} in all")
     looks = f"{len(item.surface_m)} surface points" if len(item.surface_m) else "no surface points"
-    size = " x ".join(f"{100 * side:.0f}" for side in item.size_m)
+    size = " x ".join(item.size_words)
     lines.append(f"box {size} cm, from the {item.box_source}; {looks} in this message")
+    if item.is_partly_seen:
+        lines.append("partly seen: no view shows where the sides with ≥ end")
     if item.colour_lab is not None:
         lab = ", ".join(f"{value:.0f}" for value in item.colour_lab)
         lines.append(f"colour: {item.colour} (CIELAB {lab})")

@@ -135,6 +135,24 @@ class SceneObject:
         return 0.0 if lab is None else colour_shares(lab).get(name, 0.0)
 
     @property
+    def at_least(self) -> tuple[bool, bool, bool]:
+        """Sides of `size_m` that no view shows to their end: the object may be longer."""
+        box = self.state.box
+        known = box.at_least if isinstance(box, wire.GravityBox) else None
+        return (known[0], known[1], known[2]) if isinstance(known, list) else (False, False, False)
+
+    @property
+    def is_partly_seen(self) -> bool:
+        """Whether any side of the box may be longer; false also if that is not known."""
+        return any(self.at_least)
+
+    @property
+    def size_words(self) -> list[str]:
+        """The sides of the box in centimetres, for people: ``≥ 41`` may be longer."""
+        marks = ("≥ " if more else "" for more in self.at_least)
+        return [f"{mark}{100 * side:.0f}" for mark, side in zip(marks, self.size_m)]
+
+    @property
     def height_m(self) -> float:
         """Height of the centre of the box above the origin of the world frame."""
         return float(np.dot(self.position_m, self.up))
@@ -163,6 +181,7 @@ class SceneObject:
             "position_m": _rounded(self.position_m),
             "size_m": _rounded(self.size_m),
             "orientation_xyzw": _rounded(self.orientation_xyzw, 4),
+            "at_least": list(self.at_least),
             "box_source": self.box_source,
             "colour": self.colour,
             "colour_lab": self.colour_lab,

@@ -373,6 +373,13 @@ class GravityBox(msgspec.Struct, frozen=True, gc=False):
         list[UnitPart],
         msgspec.Meta(min_length=4, max_length=4, description="axes of the box to world, unit"),
     ]
+    at_least: Annotated[
+        Union[Annotated[list[bool], msgspec.Meta(min_length=3, max_length=3)], msgspec.UnsetType],
+        msgspec.Meta(
+            description="sides of size_m that no view shows to their end: the object may be "
+            "longer; absent = none, or not known"
+        ),
+    ] = msgspec.UNSET
 
 
 class NodeState(msgspec.Struct, frozen=True, gc=False):
@@ -641,17 +648,14 @@ def decode(text: Union[str, bytes], kind: type[M], most_bytes: Optional[int] = N
             f"expected {known.name} version {known.version} or older",
         )
     checked_frame_id(message.frame_id)
-    if isinstance(message, EmbeddingsMessage):
-        try:
+    try:
+        if isinstance(message, EmbeddingsMessage):
             check_labels([message.model])
             _check_once("node", [node.id for node in message.nodes])
-        except ValueError as error:
-            raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
-    if isinstance(message, (SceneGraphMessage, SceneGraphUpdateMessage)):
-        try:
+        elif isinstance(message, (SceneGraphMessage, SceneGraphUpdateMessage)):
             _check_graph(message)
-        except ValueError as error:
-            raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
+    except ValueError as error:
+        raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
     return message
 
 
