@@ -206,6 +206,8 @@ class Relation:
         observations: number of frames with visual evidence.
         shown: number of frames that showed both objects; None = not in the message.
         entropy_nats: of the visual distribution.
+        measured_m: horizontal gap of both surfaces, bottom of the subject above the top of the
+            object, and the opposite, metres; None = not in the message.
     """
 
     subject: SceneObject
@@ -218,6 +220,7 @@ class Relation:
     observations: int
     shown: int | None
     entropy_nats: float
+    measured_m: Point | None = None
 
     @property
     def unrelated(self) -> float:
@@ -336,6 +339,11 @@ def relation_of(
         predicate = found[0].label if found else asked
         probability = min(sum(item.probability for item in found), 1.0)
     rest = edge.remainder if isinstance(edge.remainder, float) else 0.0
+    measured = None
+    if isinstance(edge.measured_m, list):
+        gap_m, rise_m, fall_m = _point(edge.measured_m)
+        is_swapped = subject.id != edge.subject
+        measured = (gap_m, fall_m, rise_m) if is_swapped else (gap_m, rise_m, fall_m)
     return Relation(
         subject=subject,
         predicate=predicate,
@@ -347,6 +355,7 @@ def relation_of(
         observations=edge.observations,
         shown=edge.shown if isinstance(edge.shown, int) else None,
         entropy_nats=edge.entropy_nats,
+        measured_m=measured,
     )
 
 

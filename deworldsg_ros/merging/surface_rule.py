@@ -114,10 +114,8 @@ class SurfaceMerging:
 
     def shown(self, nodes: NodeTable, slots: Int64) -> Bool:
         """See `Merging.shown`."""
-        cells, inside = (
-            self._records.map,
-            np.zeros((len(slots), nodes.surface_points_world.shape[1]), np.bool_),
-        )
+        cells, capacity = self._records.map, nodes.surface_points_world.shape[1]
+        inside = np.zeros((len(slots), capacity), np.bool_)
         for index, slot in enumerate(slots.tolist()):
             inside[index] = cells.points_in(cells.shown(slot), nodes, slots[index : index + 1])
         return inside
