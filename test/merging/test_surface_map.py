@@ -355,6 +355,11 @@ def test_a_map_continues_the_evidence(tmp_path: Path) -> None:
             one, other = again.graph.state(), whole.graph.state()
             np.testing.assert_array_equal(one.surface_points, other.surface_points)
             np.testing.assert_array_equal(one.surface_counts, other.surface_counts)
+    # An older release has one score of a cell.
+    arrays = graph_files.read(path)
+    arrays["merging.scores"] = np.ascontiguousarray(arrays["merging.scores"][:, SURFACE])
+    graph_files.write(path, arrays)
+    assert read_map(config, path).merging.memory()["scores"].shape[1:] == (2, 64)
     # A map of an older release starts without evidence.
     arrays = graph_files.read(path)
     for name in ("scores", "records", "looks", "fates", "frames"):
