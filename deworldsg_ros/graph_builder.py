@@ -137,7 +137,7 @@ class GraphBuilder:
         votes = frame_votes(logits, weights)
         self._edges.observe(local, node_ids, votes)
         if self._drift is not None:
-            self._boxes.observe(local, node_ids, self.up.up_world())
+            self._boxes.observe(local, node_ids, self.up.estimate)
         self.frames.note(self.graph, local, node_ids, votes)
         self.space.note(local)
         self._newest_ns = local.stamp_ns

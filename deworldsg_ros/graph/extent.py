@@ -312,8 +312,13 @@ class NodeBoxes:
                 sides = open_.any(axis=1).tolist()
         return box if sides == box.at_least else msgspec.structs.replace(box, at_least=sides)
 
-    def observe(self, local: LocalGraph, node_ids: Sequence[int], up_world: Float64) -> None:
-        """Take in what a merged frame shows of the published nodes of its rows."""
+    def observe(
+        self, local: LocalGraph, node_ids: Sequence[int], up_world: Callable[[], Float64]
+    ) -> None:
+        """Take in what a merged frame shows of the published nodes of its rows.
+
+        `up_world` estimates the direction against gravity (3,), where boxes are measured.
+        """
         self._measure(node_ids, up_world)
         rows = [row for row, node_id in enumerate(node_ids) if node_id in self._ends]
         grid = local.depth_grid
@@ -342,7 +347,7 @@ class NodeBoxes:
         for ends, is_shown, is_cut in zip(known, shown, cut & ~shown):
             ends.counts += np.stack([is_shown, is_cut], axis=2)
 
-    def _measure(self, node_ids: Sequence[int], up_world: Float64) -> None:
+    def _measure(self, node_ids: Sequence[int], up_world: Callable[[], Float64]) -> None:
         """Measure the boxes of nodes anew that have been observed often enough since."""
         nodes, due = self._nodes, []
         for node_id in node_ids:
@@ -355,7 +360,7 @@ class NodeBoxes:
         if not due:
             return
         slots = np.unique(due)
-        up = tuple(rounded(up_world, POSITION_DECIMALS))
+        up = tuple(rounded(up_world(), POSITION_DECIMALS))
         for slot, extent in zip(slots.tolist(), self.extents(slots, up)):
             ends, node_id = _Ends.of(extent.box), int(nodes.ids[slot])
             known, count = self._ends.get(node_id), int(nodes.observations[slot])
