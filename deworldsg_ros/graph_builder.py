@@ -10,6 +10,7 @@ from typing import Any
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.extent import NodeBoxes
 from deworldsg_ros.graph.graph import GlobalGraph, nodes_since
 from deworldsg_ros.graph.messages import hidden_node
 from deworldsg_ros.graph.pairs import frame_votes
@@ -65,13 +66,15 @@ class GraphBuilder:
         output = config.output
         self.graph = graph
         self.merging = build_merging(config.merging, output.min_existence)
-        # The paper takes poses as they are.
+        # The paper takes poses as they are, and has no boxes.
         self._drift = Drift() if config.merging.association == "surface" else None
         self._edges = EdgeBeliefs(config, graph, prior)
+        self._boxes = NodeBoxes(graph.nodes, lambda slots: self.merging.shown(graph.nodes, slots))
         self._publication = Publication(
             graph,
             self._edges.states,
             self._edges.refresh,
+            self._boxes,
             top_k=output.top_k,
             include_surface_points=output.include_surface_points,
         )
@@ -133,6 +136,8 @@ class GraphBuilder:
         self._add_embeddings(local, node_ids)
         votes = frame_votes(logits, weights)
         self._edges.observe(local, node_ids, votes)
+        if self._drift is not None:
+            self._boxes.observe(local, node_ids, self.up.estimate)
         self.frames.note(self.graph, local, node_ids, votes)
         self.space.note(local)
         self._newest_ns = local.stamp_ns

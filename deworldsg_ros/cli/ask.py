@@ -200,7 +200,7 @@ def _print_answers(answers: Answers, frame_id: str, console: Console) -> None:
         table.add_row(
             plain(item.name),
             " ".join(f"{value:.2f}" for value in item.position_m),
-            " × ".join(f"{100 * value:.0f}" for value in item.size_m),
+            " × ".join(item.size_words),
             f"{answer.probability:.0%}",
             odds_of(answer.probability),
             ("" if answer.is_sure else "[yellow]not sure:[/] ") + plain(answer.evidence),

@@ -413,7 +413,7 @@ def moved_object(item: SceneObject, T: Float64, frame_id: str, up: Point) -> Sce
     new = msgspec.structs.replace(
         state,
         **_geometry(means[0], covariances[0], points),
-        box=wire.GravityBox(place, list(item.size_m), turned),
+        box=msgspec.structs.replace(_box(item), center_m=place, orientation_xyzw=turned),
     )
     return scene_object(new, frame_id, up)
 
@@ -459,7 +459,12 @@ def _fused(a: SceneObject, b: SceneObject) -> wire.NodeState:
 
 
 def _box(item: SceneObject) -> wire.GravityBox:
-    return wire.GravityBox(list(item.position_m), list(item.size_m), list(item.orientation_xyzw))
+    return wire.GravityBox(
+        list(item.position_m),
+        list(item.size_m),
+        list(item.orientation_xyzw),
+        list(item.at_least) if item.is_partly_seen else msgspec.UNSET,
+    )
 
 
 def _thinned(points: Float64) -> Float64:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.boxes import gap_m, horizontal_gap_m, vertical_gap_m
 from deworldsg_ros.client.meanings import is_class
 from deworldsg_ros.client.objects import HiddenObject, Relation, SceneObject, odds_of
+from deworldsg_ros.graph.pairs import Between, contradicted
 from deworldsg_ros.graph.provenance import SeenFrames
+from deworldsg_ros.scene.vocabulary import CARRY_ON_TOP, PREDICATES, plain
 
 # Two boxes are in contact below this gap: the error of a measured extent.
 CONTACT_M = 0.04
@@ -56,8 +61,10 @@ def explain_object(
     if not item.is_sure:
         lines.append(f"not sure: it is a {item.label} with {item.probability:.0%} in all")
     looks = f"{len(item.surface_m)} surface points" if len(item.surface_m) else "no surface points"
-    size = " x ".join(f"{100 * side:.0f}" for side in item.size_m)
+    size = " x ".join(item.size_words)
     lines.append(f"box {size} cm, from the {item.box_source}; {looks} in this message")
+    if item.is_partly_seen:
+        lines.append("partly seen: no view shows where the sides with ≥ end")
     if item.colour_lab is not None:
         lab = ", ".join(f"{value:.0f}" for value in item.colour_lab)
         lines.append(f"colour: {item.colour} (CIELAB {lab})")
@@ -68,8 +75,11 @@ def explain_object(
 
 
 def explain_relation(relation: Relation, seen: SeenFrames | None = None) -> Explanation:
-    """Why a relation is in the graph: frames, sources, and the geometry of the two boxes."""
-    geometry = pair_geometry(relation.subject, relation.object)
+    """Why a relation is in the graph: frames, sources, and the geometry of the two objects.
+
+    The geometry is the one that the relation was judged by, if the message has it.
+    """
+    geometry = relation_geometry(relation)
     lines = [
         f"holds with {relation.probability:.0%} ({odds_of(relation.probability)})"
         + ("" if relation.is_sure else ": not sure"),
@@ -78,6 +88,8 @@ def explain_relation(relation: Relation, seen: SeenFrames | None = None) -> Expl
         f"no relation at all: {relation.unrelated:.0%}",
         geometry_line(geometry),
     ]
+    if is_contradicted(relation):
+        lines.append("the measured surfaces contradict it")
     others = [item for item in relation.predicates if item.label != relation.predicate]
     likely = [item for item in others if item.probability >= 0.01]
     if likely:
@@ -154,6 +166,31 @@ def explain_no_relation(a: SceneObject, b: SceneObject) -> Explanation:
     return Explanation(f"{a.name} and {b.name}", lines, geometry)
 
 
+def relation_geometry(relation: Relation) -> dict[str, Any]:
+    """The measured geometry of a relation; that of the boxes if it is not in the message."""
+    if relation.measured_m is None:
+        return pair_geometry(relation.subject, relation.object)
+    gap, rise, fall = relation.measured_m
+    whole = math.hypot(gap, max(rise, fall, 0.0))
+    return {
+        "gap_m": round(whole, 3),
+        "horizontal_gap_m": gap,
+        "bottom_above_top_m": rise,
+        "contact": whole <= CONTACT_M,
+        "from": "surfaces",
+    }
+
+
+def is_contradicted(relation: Relation) -> bool:
+    """Whether the measured geometry contradicts a relation; false if it is not in the message."""
+    kinds = [i for i, names in enumerate(PREDICATES) if plain(relation.predicate) in names]
+    if relation.measured_m is None or not kinds:
+        return False
+    between = Between(*(np.array([value]) for value in relation.measured_m))
+    on_top = np.array([plain(relation.object.label) in CARRY_ON_TOP])
+    return bool(contradicted(between, on_top)[0, kinds[0]])
+
+
 def pair_geometry(a: SceneObject, b: SceneObject) -> dict[str, Any]:
     """Gaps of two boxes in metres, and whether they are in contact."""
     gap = gap_m(a.footprint, b.footprint)
@@ -162,13 +199,15 @@ def pair_geometry(a: SceneObject, b: SceneObject) -> dict[str, Any]:
         "horizontal_gap_m": round(horizontal_gap_m(a.footprint, b.footprint), 3),
         "bottom_above_top_m": round(vertical_gap_m(a.footprint, b.footprint), 3),
         "contact": gap <= CONTACT_M,
+        "from": "boxes",
     }
 
 
 def geometry_line(geometry: dict[str, Any]) -> str:
     """The geometry of a pair as a sentence."""
     contact = "in contact" if geometry["contact"] else "not in contact"
+    rise_cm = round(100 * geometry["bottom_above_top_m"])
     return (
-        f"boxes: {contact}, gap {100 * geometry['gap_m']:.0f} cm; the bottom of the first is "
-        f"{100 * geometry['bottom_above_top_m']:.0f} cm above the top of the second"
+        f"{geometry['from']}: {contact}, gap {100 * geometry['gap_m']:.0f} cm; the bottom of the "
+        f"first is {abs(rise_cm)} cm {'above' if rise_cm >= 0 else 'below'} the top of the second"
     )

@@ -135,6 +135,24 @@ class SceneObject:
         return 0.0 if lab is None else colour_shares(lab).get(name, 0.0)
 
     @property
+    def at_least(self) -> tuple[bool, bool, bool]:
+        """Sides of `size_m` that no view shows to their end: the object may be longer."""
+        box = self.state.box
+        known = box.at_least if isinstance(box, wire.GravityBox) else None
+        return (known[0], known[1], known[2]) if isinstance(known, list) else (False, False, False)
+
+    @property
+    def is_partly_seen(self) -> bool:
+        """Whether any side of the box may be longer; false also if that is not known."""
+        return any(self.at_least)
+
+    @property
+    def size_words(self) -> list[str]:
+        """The sides of the box in centimetres, for people: ``≥ 41`` may be longer."""
+        marks = ("≥ " if more else "" for more in self.at_least)
+        return [f"{mark}{100 * side:.0f}" for mark, side in zip(marks, self.size_m)]
+
+    @property
     def height_m(self) -> float:
         """Height of the centre of the box above the origin of the world frame."""
         return float(np.dot(self.position_m, self.up))
@@ -163,6 +181,7 @@ class SceneObject:
             "position_m": _rounded(self.position_m),
             "size_m": _rounded(self.size_m),
             "orientation_xyzw": _rounded(self.orientation_xyzw, 4),
+            "at_least": list(self.at_least),
             "box_source": self.box_source,
             "colour": self.colour,
             "colour_lab": self.colour_lab,
@@ -187,6 +206,8 @@ class Relation:
         observations: number of frames with visual evidence.
         shown: number of frames that showed both objects; None = not in the message.
         entropy_nats: of the visual distribution.
+        measured_m: horizontal gap of both surfaces, bottom of the subject above the top of the
+            object, and the opposite, metres; None = not in the message.
     """
 
     subject: SceneObject
@@ -199,6 +220,7 @@ class Relation:
     observations: int
     shown: int | None
     entropy_nats: float
+    measured_m: Point | None = None
 
     @property
     def unrelated(self) -> float:
@@ -317,6 +339,11 @@ def relation_of(
         predicate = found[0].label if found else asked
         probability = min(sum(item.probability for item in found), 1.0)
     rest = edge.remainder if isinstance(edge.remainder, float) else 0.0
+    measured = None
+    if isinstance(edge.measured_m, list):
+        gap_m, rise_m, fall_m = _point(edge.measured_m)
+        is_swapped = subject.id != edge.subject
+        measured = (gap_m, fall_m, rise_m) if is_swapped else (gap_m, rise_m, fall_m)
     return Relation(
         subject=subject,
         predicate=predicate,
@@ -328,6 +355,7 @@ def relation_of(
         observations=edge.observations,
         shown=edge.shown if isinstance(edge.shown, int) else None,
         entropy_nats=edge.entropy_nats,
+        measured_m=measured,
     )
 
 

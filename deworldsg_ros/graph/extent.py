@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec import UNSET
 
 from deworldsg_ros.base.kernels import kernel
-from deworldsg_ros.scene.arrays import Float32, Float64, Int64
-from deworldsg_ros.scene.camera import quaternion_from_rotation
+from deworldsg_ros.graph.nodes import NodeTable
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+from deworldsg_ros.scene.camera import invert_pose, pose_from_quaternion, quaternion_from_rotation
 from deworldsg_ros.scene.checks import check_array
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M
 from deworldsg_ros.wire import messages as wire
 
@@ -24,17 +29,37 @@ EVEN_RADIUS_M = 0.015
 OUTLIER_FACTOR = 2.0
 # So few points have no outliers.
 FEW_POINTS = 6
+# A part of a surface so far from the rest, horizontally, and with so much fewer points than the
+# largest one, belongs to something else: the legs of a chair are nearer to one another.
+PART_GAP_M, SMALL_PART = 0.12, 0.1
+# With fewer points that the images show as the node's, its box is around all points.
+MIN_SHOWN_POINTS = 8
+# A frame shows where a side of a box ends if it shows what is beyond this fraction at least of the
+# points so near its end: what is so far beyond them is in the image, and nothing is before it by
+# the noise of a camera.
+END_M, BEYOND_M = 0.04, 0.06
+SEEN_FRACTION = 0.3
+BEFORE_M, BEFORE_FRACTION = 0.03, 0.01
+# Points are of a box up to this distance from it.
+AROUND_M = 0.02
+# Ends of two boxes are the same within `END_M` if their axes are within this.
+SAME_COS = math.cos(math.radians(15.0))
+# A side may go on if so many frames end before it does, and no more than this fraction show its
+# end: masks and depth are wrong in some.
+MIN_CUT, MAX_SEEN = 2, 0.1
 # Weights of points with these many points around.
 _EVEN_WEIGHTS = np.append(0.0, np.arange(1.0, 4097.0) ** -0.5)
-# Heading of a box: the smallest rectangle of these directions, over 90 degrees.
+# Headings of a box, over 90 degrees. The smallest rectangle around two sides of a cabinet lies
+# along its diagonal; the one whose sides are nearest to the points does not.
 _HEADINGS = 0.5 * math.pi * np.arange(45) / 45
 _COSINES = np.array([math.cos(heading) for heading in _HEADINGS])
 _SINES = np.array([math.sin(heading) for heading in _HEADINGS])
 # Bounds of all headings, in whole cache lines: across lines, they take up to twice the time.
 ALIGNED_HEADINGS = 48
-# Points of a box, the first ones: surfaces are stored in random order. 256 of 512 take a quarter of
-# the time and cost 0.2 cm of the median extent.
-MOST_POINTS = 256
+# Points of a box, the first ones: surfaces are stored in random order, and have no more in a graph.
+# With 256, ten of 154 boxes lose a part that few views show. Without images, which tell the points
+# of other objects apart, that many are enough.
+MOST_POINTS, FEWER_POINTS = 512, 256
 # The up of the world frame if nothing tells it (REP 103).
 DEFAULT_UP = (0.0, 0.0, 1.0)
 # Points that spread less are at one place: the number of buckets for each metre stays finite.
@@ -65,7 +90,11 @@ class Extent(NamedTuple):
 
 
 def extents_of(
-    points_world: Float32, counts: Int64, rows: Int64, up: Sequence[float]
+    points_world: Float32,
+    counts: Int64,
+    rows: Int64,
+    up: Sequence[float],
+    shown: Bool | None = None,
 ) -> list[Extent]:
     """Extents of the surfaces of some rows.
 
@@ -74,16 +103,36 @@ def extents_of(
         counts: (S,) 1 or more in the rows.
         rows: (n,).
         up: unit vector against gravity.
+        shown: (n, K) bool, points that the images show as the node's. The boxes are around these;
+            None = not known.
     """
     frame, measured = _frame_of(tuple(up)), np.empty((len(rows), 22))
-    for row, count, result in zip(rows.tolist(), counts[rows].tolist(), measured):
-        columns = _columns(points_world[row, :count])
+    for index, (row, count) in enumerate(zip(rows.tolist(), counts[rows].tolist())):
+        columns, result = _columns(points_world[row, :count]), measured[index]
         _even_moments(columns, result[:12])
-        _box(columns, *frame, result[12:])
+        if shown is not None and shown[index, :count].sum() >= MIN_SHOWN_POINTS:
+            columns = np.ascontiguousarray(columns[:, shown[index, :count]])
+        _box_around(columns, *frame, shown is None, result[12:])
     return [
         Extent(row[:3], row[3:12], wire.GravityBox(row[12:15], row[15:18], row[18:]))
         for row in _rounded(measured).tolist()
     ]
+
+
+def _box_around(
+    columns: Float64, axes: Float64, quat_axes: Float64, is_smallest: bool, box: Float64
+) -> None:
+    """Write the box around columns (3, n) without outliers, see `_box`.
+
+    The smallest one is around all parts of fewer points.
+    """
+    if is_smallest:
+        columns = columns[:, :FEWER_POINTS].copy()
+    upright, squared = _third_neighbours(columns, axes)
+    upright = upright[:, squared <= OUTLIER_FACTOR**2 * np.median(squared)]
+    if not is_smallest:
+        upright = upright[:, _in_main_parts(np.ascontiguousarray(upright))]
+    _box(np.ascontiguousarray(upright), axes, quat_axes, is_smallest, box)
 
 
 def rounded_gaussians(means: Float64, covariances: Float64, rows: Int64) -> list[list[float]]:
@@ -128,7 +177,7 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
     """
     _check_points(points_world)
     box = np.empty(10)
-    _box(_columns(points_world[:MOST_POINTS]), *_frame_of(tuple(up)), box)
+    _box_around(_columns(points_world), *_frame_of(tuple(up)), True, box)
     return wire.GravityBox(
         rounded(box[:3], BOX_DECIMALS),
         rounded(box[3:6], BOX_DECIMALS),
@@ -187,6 +236,177 @@ def surface_points(node: wire.NodeState) -> Float64:
         return np.asarray(offsets * 1e-3 + np.array(node.mean_m))
     points = node.surface_points_m if isinstance(node.surface_points_m, list) else []
     return np.array(points, np.float64).reshape(-1, 3)
+
+
+# --- The boxes of nodes: which of their sides end where they say.
+#
+# A side of a box ends where a view shows what is beyond. The object may go on if the border of the
+# image cuts it, if something is before it, or if it is behind the object itself.
+
+# Which surface points (n, K) the images show as those of n slots; None = not known.
+ShownSurfaces = Callable[[Int64], Bool | None]
+# The two ends of an axis.
+_SIGNS = np.array([-1.0, 1.0])
+# A box is measured again after this fraction of its frames, and so many at least and at most.
+AGAIN_FRACTION, LEAST_FRAMES, MOST_FRAMES = 0.5, 4, 32
+
+
+@dataclass
+class _Ends:
+    """A box, and the frames that show where it ends.
+
+    Attributes:
+        center: (3,), half: (3,) metres; axes: (3, 3) rows.
+        counts: (3, 2, 2), by axis and end: frames that show what is beyond, and that do not.
+        due: number of observations of the node from which on it is measured again.
+    """
+
+    center: Float64
+    half: Float64
+    axes: Float64
+    counts: Int64
+    due: int = 0
+
+    @classmethod
+    def of(cls, box: wire.GravityBox) -> _Ends:
+        """Those of a new box."""
+        axes = pose_from_quaternion(np.zeros(3), np.array(box.orientation_xyzw))[:3, :3].T
+        half = np.array(box.size_m) / 2.0
+        return cls(np.array(box.center_m), half, axes, np.zeros((3, 2, 2), np.int64))
+
+    def shared(self, other: _Ends) -> Bool:
+        """Which ends (3, 2) of another box are those of this one, too."""
+        apart = np.abs(self.axes @ (self.center - other.center))[:, None]
+        apart = apart * [1.0, 1.0] + np.abs(self.half - other.half)[:, None]
+        same = (self.axes * other.axes).sum(axis=1) > SAME_COS
+        return np.asarray((apart < END_M) & same[:, None])
+
+
+class NodeBoxes:
+    """Measures the boxes of nodes, and follows where they end.
+
+    Args:
+        nodes: of the graph.
+        shown: of their surfaces; None = boxes are around all points.
+    """
+
+    def __init__(self, nodes: NodeTable, shown: ShownSurfaces | None = None) -> None:
+        self._nodes = nodes
+        self._shown = shown
+        self._ends: dict[int, _Ends] = {}
+
+    def extents(self, slots: Int64, up: Sequence[float]) -> list[Extent]:
+        """Extents of the surfaces of some slots, which have points."""
+        nodes, shown = self._nodes, None if self._shown is None else self._shown(slots)
+        return extents_of(nodes.surface_points_world, nodes.surface_counts, slots, up, shown)
+
+    def followed(self, node_id: int, box: wire.GravityBox) -> wire.GravityBox:
+        """The box of a node, with the sides that may go on."""
+        known, sides = self._ends.get(node_id), UNSET
+        if known is not None:
+            seen, cut = known.counts.transpose(2, 0, 1)
+            open_ = (cut >= MIN_CUT) & (seen <= MAX_SEEN * (seen + cut))
+            if open_.any():
+                open_ &= known.shared(_Ends.of(box))
+            if open_.any():
+                sides = open_.any(axis=1).tolist()
+        return box if sides == box.at_least else msgspec.structs.replace(box, at_least=sides)
+
+    def observe(
+        self, local: LocalGraph, node_ids: Sequence[int], up_world: Callable[[], Float64]
+    ) -> None:
+        """Take in what a merged frame shows of the published nodes of its rows.
+
+        `up_world` estimates the direction against gravity (3,), where boxes are measured.
+        """
+        self._measure(node_ids, up_world)
+        rows = [row for row, node_id in enumerate(node_ids) if node_id in self._ends]
+        grid = local.depth_grid
+        if grid is None or grid.instances is None or not rows:
+            return
+        known = [self._ends[node_ids[row]] for row in rows]
+        surfaces = [local.surface_points_world[row] for row in rows]
+        of = np.repeat(np.arange(len(rows)), [len(points) for points in surfaces])
+        points = np.concatenate(surfaces).astype(np.float64)
+        axes = np.array([ends.axes for ends in known])[of]
+        half = np.array([ends.half for ends in known])[of]
+        along = points - np.array([ends.center for ends in known])[of]
+        along = (axes * along[:, None]).sum(axis=2)
+        inside = (np.abs(along) <= half + AROUND_M).all(axis=1)
+        near = half[:, :, None] - along[:, :, None] * _SIGNS < END_M
+        places, sides, at = np.nonzero(near & inside[:, None, None])
+        beyond = points[places] + BEYOND_M * _SIGNS[at, None] * axes[places, sides]
+        bears = (sides == 2) & (at == 0)
+        values = local.instance_ids[rows][of[places]]
+        seen = _seen_beyond(local, grid, points[places], beyond, bears, values)
+        size = 6 * len(rows)
+        cells = 6 * of[places] + 2 * sides + at
+        total = np.maximum(np.bincount(cells, minlength=size), 1)
+        parts = [np.bincount(cells, kind, size) >= SEEN_FRACTION * total for kind in seen]
+        shown, cut = np.reshape(parts, (2, len(rows), 3, 2))
+        for ends, is_shown, is_cut in zip(known, shown, cut & ~shown):
+            ends.counts += np.stack([is_shown, is_cut], axis=2)
+
+    def _measure(self, node_ids: Sequence[int], up_world: Callable[[], Float64]) -> None:
+        """Measure the boxes of nodes anew that have been observed often enough since."""
+        nodes, due = self._nodes, []
+        for node_id in node_ids:
+            slot = nodes.slot_of.get(node_id, -1)
+            if slot < 0 or not nodes.confirmed[slot] or not nodes.surface_counts[slot]:
+                continue
+            known = self._ends.get(node_id)
+            if known is None or nodes.observations[slot] >= known.due:
+                due.append(slot)
+        if not due:
+            return
+        slots = np.unique(due)
+        up = tuple(rounded(up_world(), POSITION_DECIMALS))
+        for slot, extent in zip(slots.tolist(), self.extents(slots, up)):
+            ends, node_id = _Ends.of(extent.box), int(nodes.ids[slot])
+            known, count = self._ends.get(node_id), int(nodes.observations[slot])
+            if known is not None:
+                ends.counts = known.counts * known.shared(ends)[:, :, None]
+            wait = min(max(int(AGAIN_FRACTION * count), LEAST_FRAMES), MOST_FRAMES)
+            ends.due, self._ends[node_id] = count + wait, ends
+        if len(self._ends) > 2 * len(nodes) + FEW_POINTS:
+            self._ends = {i: ends for i, ends in self._ends.items() if i in nodes}
+
+
+def _seen_beyond(
+    local: LocalGraph,
+    grid: DepthGrid,
+    points: Float64,
+    beyond: Float64,
+    bears: Bool,
+    values: Int64,
+) -> tuple[Bool, Bool]:
+    """Whether a frame shows what is beyond points (n, 3), (n,) bool; and whether it hides it.
+
+    Neither: there is no depth, or the object goes on.
+
+    Args:
+        local: the frame, and
+        grid: its depth grid, with instances.
+        points: of objects.
+        beyond: (n, 3) points beyond these.
+        bears: (n,) bool, whether a surface between both bears the object, and hides nothing.
+        values: (n,) of the objects in the instances.
+    """
+    T, camera, per_px = invert_pose(local.T_world_camera), grid.intrinsics, 1.0 / grid.stride_px
+    x, y, z = T[:3, :3] @ beyond.T + T[:3, 3:]
+    own_z = T[2, :3] @ points.T + T[2, 3]
+    ahead = np.maximum(z, 1e-3)
+    rows = np.floor((camera.fy * y / ahead + camera.cy) * per_px)
+    columns = np.floor((camera.fx * x / ahead + camera.cx) * per_px)
+    height, width = grid.depth_mm.shape
+    inside = (z > 1e-3) & (rows >= 0) & (columns >= 0) & (rows < height) & (columns < width)
+    at = np.where(inside, rows, 0).astype(np.int64), np.where(inside, columns, 0).astype(np.int64)
+    depth_m = 0.001 * grid.depth_mm[at]
+    limit_m = np.where(bears, np.minimum(own_z, z), z) - BEFORE_M - BEFORE_FRACTION * ahead
+    hidden, known = depth_m < limit_m, depth_m > 0
+    assert grid.instances is not None
+    shown = inside & known & ~hidden & (grid.instances[at] != values)
+    return np.asarray(shown), np.asarray(~inside | (known & hidden))
 
 
 @kernel
@@ -307,49 +527,48 @@ def _third_neighbours(columns: Float64, axes: Float64) -> tuple[Float64, Float64
 
 
 @kernel
-def _median(values: Float64) -> float:
-    """The median of values (n,), which change their order (Hoare's selection)."""
-    last, middle = len(values) - 1, len(values) // 2
-    low, high = 0, last
-    while low < high:
-        pivot, left, right = values[(low + high) // 2], low, high
-        while left <= right:
-            while values[left] < pivot:
-                left += 1
-            while values[right] > pivot:
-                right -= 1
-            if left <= right:
-                values[left], values[right] = values[right], values[left]
-                left += 1
-                right -= 1
-        if middle <= right:
-            high = right
-        elif middle >= left:
-            low = left
-        else:
-            break
-    above = float(values[middle])
-    if last % 2 == 0:
-        return above
-    below = float(values[0])
-    for index in range(middle):
-        below = max(below, float(values[index]))
-    return (below + above) / 2.0
+def _in_main_parts(upright: Float64) -> Bool:
+    """Which of points (3, n) belong to a part of the footprint that is not small; (n,) bool.
+
+    Points within `PART_GAP_M` of one another, horizontally, are of one part.
+    """
+    count, parts = upright.shape[1], 0
+    part_of, sizes = np.full(count, -1), np.zeros(count, np.int64)
+    waiting = np.empty(count, np.int64)
+    for first in range(count):
+        if part_of[first] >= 0:
+            continue
+        part_of[first], waiting[0], last = parts, first, 1
+        while last > 0:
+            last -= 1
+            place = waiting[last]
+            sizes[parts] += 1
+            for other in range(count):
+                step_x = upright[0, other] - upright[0, place]
+                step_y = upright[1, other] - upright[1, place]
+                near = step_x * step_x + step_y * step_y <= PART_GAP_M * PART_GAP_M
+                if near and part_of[other] < 0:
+                    part_of[other], waiting[last] = parts, other
+                    last += 1
+        parts += 1
+    large: Bool = sizes[part_of] >= SMALL_PART * sizes.max()
+    return large
 
 
 @kernel
-def _box(columns: Float64, axes: Float64, quat_axes: Float64, box: Float64) -> None:
-    """Write `box_of` columns (3, n): centre, size and quaternion, (10,)."""
-    upright, squared = _third_neighbours(columns, axes)
-    most = OUTLIER_FACTOR**2 * _median(squared.copy())
+def _box(
+    upright: Float64, axes: Float64, quat_axes: Float64, is_smallest: bool, box: Float64
+) -> None:
+    """Write the box around upright points (3, n): centre, size and quaternion, (10,).
+
+    Its footprint is the smallest, or the one whose sides are nearest to the points.
+    """
     # Vertical bounds, and horizontal ones along the axes of each heading.
     low, high, bounds = np.inf, -np.inf, np.empty((4, ALIGNED_HEADINGS), np.float64)
     lefts, rights, backs, fronts = bounds[0], bounds[1], bounds[2], bounds[3]
     for step in range(len(_HEADINGS)):
         lefts[step], rights[step], backs[step], fronts[step] = np.inf, -np.inf, np.inf, -np.inf
     for place in range(upright.shape[1]):
-        if not squared[place] <= most:
-            continue
         x, y, z = upright[0, place], upright[1, place], upright[2, place]
         low, high = min(low, z), max(high, z)
         # The compiler makes vectors of this.
@@ -358,12 +577,21 @@ def _box(columns: Float64, axes: Float64, quat_axes: Float64, box: Float64) -> N
             v = _COSINES[step] * y - _SINES[step] * x
             lefts[step], rights[step] = min(lefts[step], u), max(rights[step], u)
             backs[step], fronts[step] = min(backs[step], v), max(fronts[step], v)
-    best, area = 0, np.inf
-    for step in range(len(_HEADINGS)):
-        found = (rights[step] - lefts[step]) * (fronts[step] - backs[step])
+    costs = np.zeros(ALIGNED_HEADINGS, np.float64)
+    for step in range(len(_HEADINGS) if is_smallest else 0):
+        costs[step] = (rights[step] - lefts[step]) * (fronts[step] - backs[step])
+    for place in range(0 if is_smallest else upright.shape[1]):
+        x, y = upright[0, place], upright[1, place]
+        for step in range(len(_HEADINGS)):
+            u = _COSINES[step] * x + _SINES[step] * y
+            v = _COSINES[step] * y - _SINES[step] * x
+            apart = min(u - lefts[step], rights[step] - u)
+            costs[step] += min(apart, v - backs[step], fronts[step] - v) / upright.shape[1]
+    best = 0
+    for step in range(1, len(_HEADINGS)):
         # Ties go to the axes of the world.
-        if found < area - 1e-12:
-            best, area = step, found
+        if costs[step] < costs[best] - 1e-12:
+            best = step
     left, right, back, front = lefts[best], rights[best], backs[best], fronts[best]
     box[3], box[4], box[5] = right - left, front - back, high - low
     u, v, w = (left + right) / 2, (back + front) / 2, (low + high) / 2

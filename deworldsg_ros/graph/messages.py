@@ -16,7 +16,7 @@ from deworldsg_ros.graph.extent import (
     DEFAULT_UP,
     POSITION_DECIMALS,
     Extent,
-    extents_of,
+    NodeBoxes,
     rounded,
     rounded_gaussians,
     surface_bytes,
@@ -147,13 +147,21 @@ class NodeStates:
         graph: of the nodes.
         top_k: number of labels of each node.
         even_gaussians: show the `even_moments` of a node's surface instead of the pooled Gaussian.
+        boxes: of the nodes; None = around all of their points.
 
     Attributes:
         up: unit vector against gravity, for the boxes.
         states: messages by id. Those of nodes that did not change are the same objects as before.
     """
 
-    def __init__(self, graph: GlobalGraph, top_k: int, even_gaussians: bool) -> None:
+    def __init__(
+        self,
+        graph: GlobalGraph,
+        top_k: int,
+        even_gaussians: bool,
+        boxes: NodeBoxes | None = None,
+    ) -> None:
+        self._boxes = NodeBoxes(graph.nodes) if boxes is None else boxes
         self.states: dict[int, wire.NodeState] = {}
         self._graph = graph
         self._top_k = top_k
@@ -243,8 +251,7 @@ class NodeStates:
         slots = nodes.slots_of(due)
         self._measured.update(zip(due, revisions[slots].tolist()))
         solid = nodes.surface_counts[slots] > 0
-        surfaces = nodes.surface_points_world, nodes.surface_counts
-        found = iter(extents_of(*surfaces, slots[solid], self.up))
+        found = iter(self._boxes.extents(slots[solid], self.up))
         return {
             node_id: next(found) if has_points else None
             for node_id, has_points in zip(due, solid.tolist())
@@ -276,7 +283,7 @@ class NodeStates:
                 remainder=classes.remainder,
                 mean_m=mean,
                 covariance_m2=covariance,
-                box=UNSET if extent is None else extent.box,
+                box=UNSET if extent is None else self._boxes.followed(node_id, extent.box),
                 observations=observations,
                 confirmed=True,
                 existence=existence if existence >= 0 else UNSET,

@@ -604,3 +604,46 @@ def frame_votes(logits: Float64, weights: SoftmaxWeights | None = None) -> Float
     related = np.exp(-np.logaddexp(0.0, -best))
     votes: Float64 = related * exponentials / totals
     return votes
+
+
+# --- What the measured geometry of two objects contradicts, whatever was seen otherwise.
+#
+# The limits are beyond the error of measured bounds, also with masks that bleed.
+
+# What touches has no wider horizontal gap, and what is near none of a metre.
+TOUCH_GAP_M, NEAR_GAP_M = 0.15, 1.0
+# What rests on or in something begins no higher above its top, and on one that has no place below
+# its top, no deeper.
+RISE_M, SUNK_M = 0.2, 0.3
+
+
+class Between(NamedTuple):
+    """Measured geometry of n ordered pairs, (n,) each, metres.
+
+    Attributes:
+        gap_m: horizontal gap of the bounds of both; 0 if they overlap.
+        rise_m: bottom of the subject above the top of the object.
+        fall_m: bottom of the object above the top of the subject.
+    """
+
+    gap_m: Float64
+    rise_m: Float64
+    fall_m: Float64
+
+
+def contradicted(between: Between, on_top: Bool) -> Bool:
+    """Which relations the geometry of pairs contradicts, (n, 7), in the order of their names.
+
+    The names are those of `scene.vocabulary.PREDICATES`.
+
+    Args:
+        between: subjects and objects.
+        on_top: (n,) whether the object is of `scene.vocabulary.CARRY_ON_TOP`.
+    """
+    gap_m, rise_m, fall_m = between
+    apart = gap_m > TOUCH_GAP_M
+    unborne = apart | (rise_m > RISE_M) | (fall_m > 0.0)
+    sunk = on_top & (rise_m < -SUNK_M)
+    above, under = apart | (fall_m > 0.0), apart | (rise_m > 0.0)
+    far = gap_m > NEAR_GAP_M
+    return np.stack([unborne | sunk, unborne, apart, apart, above, under, far], axis=-1)

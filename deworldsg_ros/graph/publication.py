@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import msgspec
 
+from deworldsg_ros.graph.extent import NodeBoxes
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeStates, some_of
 from deworldsg_ros.graph.pairs import Pair
@@ -35,6 +36,7 @@ class Publication:
         graph: to publish.
         edges: the messages of its edges by pair, kept up to date by
         refresh_edges: its argument says whether nothing may wait.
+        boxes: of the nodes.
         top_k: number of labels of each node.
         include_surface_points: whether snapshots and updates contain surface points.
     """
@@ -44,6 +46,7 @@ class Publication:
         graph: GlobalGraph,
         edges: Mapping[Pair, wire.EdgeState],
         refresh_edges: EdgeRefresh,
+        boxes: NodeBoxes,
         *,
         top_k: int,
         include_surface_points: bool,
@@ -52,7 +55,7 @@ class Publication:
         self._edges = edges
         self._refresh_edges = refresh_edges
         self._include_surface_points = include_surface_points
-        self._nodes = NodeStates(graph, top_k, graph.even_gaussians)
+        self._nodes = NodeStates(graph, top_k, graph.even_gaussians, boxes)
         # Frames to come may be older than the newest one of a map.
         self._stamp_ns = int(graph.nodes.last_seen_ns.max(initial=0))
         # Clients cannot use associations of frames that the graph has forgotten.

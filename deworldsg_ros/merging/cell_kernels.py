@@ -18,6 +18,9 @@ INDEX_BIAS = 1 << 20
 INDEX_MASK = (1 << 21) - 1
 # An owner with fewer cells says too little by lying within a set.
 MIN_OWNER_CELLS = 4
+# Scores of a cell: that it is its owner's surface, by surface points and images; by images alone.
+SURFACE, SHOWN = range(2)
+SCORES = 2
 # A block and the touching cells of its six neighbours have 160 cells with four owners each.
 MAX_BLOCK_OWNERS = 640
 # The six faces of a block. For each face: its cells, the rotation to the right that turns their
@@ -67,9 +70,9 @@ class CellTable(NamedTuple):
         masks: (n,) uint64, cells in the block.
         owners: (n,) int32; -1 = removed.
         marks: (n,) uint64, cells that a query has met; zero between queries.
-        rejected: (n,) uint64, cells with a negative score.
-        scores: (n, 64) int8, evidence that each cell is the owner's surface (`surface_map`). It
-            stays when the owner loses the cell.
+        rejected: (n,) uint64, cells with a negative score `SURFACE`.
+        scores: (n, SCORES, 64) int8, evidence on each cell of the owner (`surface_map`). It stays
+            when the owner loses the cell.
         nexts: (n,) int32, next row of the same owner; -1 = none.
     """
 
@@ -101,7 +104,7 @@ def new_table(capacity: int) -> CellTable:
         np.zeros(room, np.int32),
         np.zeros(room, np.uint64),
         np.zeros(room, np.uint64),
-        np.zeros((room, 64), np.int8),
+        np.zeros((room, SCORES, 64), np.int8),
         np.zeros(room, np.int32),
     )
 
@@ -439,8 +442,9 @@ def rehash(table: TableArrays, used: int, larger: TableArrays, firsts: Int64) ->
         new_masks[count] = masks[row]
         new_owners[count] = owner
         new_rejected[count] = rejected[row]
-        for cell in range(64):
-            new_scores[count, cell] = scores[row, cell]
+        for score in range(SCORES):
+            for cell in range(64):
+                new_scores[count, score, cell] = scores[row, score, cell]
         new_nexts[count] = firsts[owner]
         firsts[owner] = count
         count += 1

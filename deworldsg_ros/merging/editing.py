@@ -534,7 +534,7 @@ def _transfer(
         rows = {block: row for row, block in enumerate(cells.blocks.tolist())}
         cells = target.map.cells_of([centres[belongs(centres)]])
         scores = scores[[rows[block] for block in cells.blocks.tolist()]]
-        scores *= cell_bits(cells.masks).astype(np.int8)
+        scores *= cell_bits(cells.masks)[:, None].astype(np.int8)
     node_id = int(graph.nodes.ids[to])
     target.add(to, node_id, graph.nodes.class_probabilities[to])
     target.rows[to] = source.rows[slot]

@@ -16,7 +16,7 @@ from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.editing import Editor, EditReply, may_merge
 from deworldsg_ros.merging.life_cycle import DELETED
-from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant
 
@@ -208,6 +208,10 @@ class PaperMerging:
     def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """The deleted nodes; all others are published."""
         return dict.fromkeys(sorted(graph.edits.deleted), DELETED)
+
+    def shown(self, nodes: NodeTable, slots: Int64) -> Bool | None:
+        """See `Merging.shown`."""
+        return None
 
     def edit(self, graph: GlobalGraph, request: EditRequest, stamp_ns: int) -> EditReply:
         """See `Merging.edit`."""

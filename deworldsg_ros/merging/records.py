@@ -12,7 +12,7 @@ from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.merging import beliefs, surface_map
 from deworldsg_ros.merging.beliefs import LABELS
-from deworldsg_ros.merging.cell_kernels import CellSets
+from deworldsg_ros.merging.cell_kernels import SCORES, CellSets
 from deworldsg_ros.merging.matching import JointEvidence
 from deworldsg_ros.merging.surface_map import CELLS_PER_OWNER, VoxelMap
 from deworldsg_ros.merging.views import VISIBILITIES, NodeGrid
@@ -123,7 +123,7 @@ def _check_names(records: NDArray[np.void], class_count: int) -> None:
 def _check_cells(memory: Arrays, count: int) -> None:
     blocks = checked(memory, "blocks", np.int64, None)
     masks = checked(memory, "masks", np.uint64, len(blocks))
-    scores = checked(memory, "scores", np.int8, len(blocks), 64)
+    scores = checked(memory, "scores", np.int8, len(blocks), SCORES, 64)
     counts = checked(memory, "block_counts", np.int64, count)
     lengths("block_counts", counts, len(blocks))
     holds("blocks", (blocks & ~np.int64(_BLOCK_MASK) == 0).all(), "three indices of 19 bits")
@@ -185,7 +185,7 @@ class NodeRecords:
 
     def frames_before(self, mean_world: Float64, camera_world: Float64) -> int:
         """Number of frames just before that had a place (3,) in view from the same viewpoint."""
-        count = 0
+        count, camera_world = 0, camera_world.copy()
         for T, (fx, fy, cx, cy, width, height) in self.recent:
             x, y, z = T[:3, :3] @ mean_world + T[:3, 3]
             other = -T[:3, :3].T @ T[:3, 3]
@@ -341,6 +341,9 @@ class NodeRecords:
         if "frames" not in memory or checked(memory, "cell_m", np.float64) != self.map.cell_m:
             _rebuild(self, graph, slots)
             return
+        if memory["scores"].ndim == 2:  # an older release has one score of a cell
+            both = np.repeat(memory["scores"][:, None], SCORES, axis=1)
+            memory = {**memory, "scores": both}
         check_memory(memory, RECORD, len(graph.vocabulary.classes))
         records, counts = memory["records"], memory["block_counts"]
         kept = np.isin(records["node_id"], node_ids)

@@ -8,10 +8,11 @@ from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
 from deworldsg_ros.graph.graph import GlobalGraph
+from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.paper_rule import PaperMerging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.frame_graph import LocalGraph
 
 
@@ -39,6 +40,10 @@ class Merging(Protocol):
 
     def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """The nodes that are not published, each with its reason, in words."""
+        ...
+
+    def shown(self, nodes: NodeTable, slots: Int64) -> Bool | None:
+        """Which surface points (n, K) the images show as those of n nodes; None = not known."""
         ...
 
     def memory(self) -> Arrays:

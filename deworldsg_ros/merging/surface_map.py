@@ -14,6 +14,8 @@ from deworldsg_ros.merging import cell_kernels
 from deworldsg_ros.merging.cell_kernels import (
     INDEX_BIAS,
     INDEX_MASK,
+    SHOWN,
+    SURFACE,
     CellSets,
     SumArrays,
     TableArrays,
@@ -36,6 +38,12 @@ HIT = 2
 MISS = 3
 # Bounds of a score, so that a cell can be rejected or accepted again: 60 hits, 40 misses.
 MAX_SCORE = 120
+# A box is around the cells that the images alone show as the owner's, in three frames of four and
+# at least four. A surface point is no evidence here: it hits its cell whatever the image says, and
+# so do those of a bleeding mask. Cells of a younger owner need less.
+HIT_SHOWN = 1
+MISS_SHOWN = 3
+LEAST_SHOWN = 4
 # A frame shows a cell if the measured depth differs from that of its centre by at most SHOWN_M and
 # SHOWN_FRACTION of it: the distance of a cell's corner from its centre, and the noise of cameras.
 SHOWN_M = 0.03
@@ -117,12 +125,12 @@ def _judge_block(
     offsets: Float64,
     cell_m: float,
 ) -> tuple[np.uint64, np.uint64]:
-    """Update the scores (64,) of the cells of a block that a frame shows.
+    """Update the scores (SCORES, 64) of the cells of a block that a frame shows.
 
     A marked cell is hit, and one in a pixel with this value; another one is missed.
 
     Returns:
-        The cells whose score was updated, and those of them with a negative one.
+        The cells whose score `SURFACE` was updated, and those of them with a negative one.
     """
     T, depth_mm, instances, (fx, fy, cx, cy) = frame
     rows, columns = depth_mm.shape
@@ -138,24 +146,24 @@ def _judge_block(
         bit = cells & (~cells + np.uint64(1))
         cells ^= bit
         cell = bit_count(bit - np.uint64(1))
-        step = HIT
-        if marked & bit == 0:
-            depth_m = ahead + offsets[cell, 2]
-            if depth_m < NEAR_M:
-                continue
+        depth_m = ahead + offsets[cell, 2]
+        shown = is_own = False
+        if depth_m >= NEAR_M:
             u = fx * (right + offsets[cell, 0]) / depth_m + cx
             v = fy * (down + offsets[cell, 1]) / depth_m + cy
-            if u < 0.0 or v < 0.0 or u >= columns or v >= rows:
-                continue
-            row, column = int(v), int(u)
-            measured_mm = depth_mm[row, column]
-            apart_m = abs(0.001 * measured_mm - depth_m)
-            if measured_mm == 0 or apart_m > SHOWN_M + SHOWN_FRACTION * depth_m:
-                continue
-            if instances[row, column] != value:
-                step = -MISS
-        score = scores[cell] + step
-        scores[cell] = min(max(score, -MAX_SCORE), MAX_SCORE)
+            if u >= 0.0 and v >= 0.0 and u < columns and v < rows:
+                row, column = int(v), int(u)
+                apart_m = abs(0.001 * depth_mm[row, column] - depth_m)
+                shown = apart_m <= SHOWN_M + SHOWN_FRACTION * depth_m
+                is_own = shown and instances[row, column] == value
+        if shown:
+            score = scores[SHOWN, cell] + (HIT_SHOWN if is_own else -MISS_SHOWN)
+            scores[SHOWN, cell] = min(max(score, -MAX_SCORE), MAX_SCORE)
+        is_hit = is_own or marked & bit != 0
+        if not shown and not is_hit:
+            continue
+        score = scores[SURFACE, cell] + (HIT if is_hit else -MISS)
+        scores[SURFACE, cell] = min(max(score, -MAX_SCORE), MAX_SCORE)
         changed |= bit
         if score < 0:
             lost |= bit
@@ -212,7 +220,7 @@ class VoxelMap:
         return CellSets(blocks, masks, np.array([0, len(rows)]))
 
     def scores(self, owner: int) -> Int8:
-        """Score of each cell in each block of `cells` (m, 64)."""
+        """Scores of each cell in each block of `cells` (m, SCORES, 64)."""
         return self._table.scores[self._rows_of(owner)]
 
     def memory(self, owners: Int64) -> Arrays:
@@ -261,15 +269,14 @@ class VoxelMap:
         )
 
     def add_scores(self, owners: Sequence[int] | Int64, sets: CellSets, scores: Int8) -> None:
-        """Add to the scores of owners' cells, (m, 64): those of each block of their sets.
+        """Add to the scores of owners' cells, (m, SCORES, 64): of each block of their sets.
 
         Blocks without a cell of the owner are left out.
         """
         rows, known = self._rows_at(np.array(owners, np.int64), sets)
         sums = np.clip(self._table.scores[rows] + scores[known].astype(int), -MAX_SCORE, MAX_SCORE)
         self._table.scores[rows] = sums
-        negative = np.packbits(sums < 0, axis=1, bitorder="little")
-        self._table.rejected[rows] = negative.view("<u8")[:, 0]
+        self._table.rejected[rows] = _masks(sums[:, SURFACE] < 0)
 
     def judge(
         self,
@@ -293,6 +300,17 @@ class VoxelMap:
         self._table.marks[rows] = sets.masks[known]
         changed = judge(self._table[:], self._firsts, owners, values, frame, self.cell_m)
         return CellSets(*changed)
+
+    def shown(self, owner: int) -> CellSets:
+        """The cells that the images alone show as the owner's, as one set."""
+        rows = self._rows_of(owner)
+        scores = self._table.scores[rows]
+        cells = (cell_bits(self._table.masks[rows]) > 0) & (scores[:, SURFACE] >= 0)
+        shown = np.maximum(scores[:, SHOWN][cells], 0)
+        # Thin and small things are in few pixels of the depth grid.
+        least = min(LEAST_SHOWN, 0.25 * float(np.quantile(shown, 0.75))) if len(shown) else 0.0
+        own = cells & (scores[:, SHOWN] >= least)
+        return CellSets(self._table.blocks[rows], _masks(own), np.array([0, len(rows)]))
 
     def points_in(self, sets: CellSets, nodes: NodeTable, slots: Int64) -> Bool:
         """Which surface points of nodes lie in a cell of a set: (n, K), by slot and by set."""
@@ -368,6 +386,11 @@ def cell_bits(masks: UInt64) -> UInt64:
     """Which cells of blocks are in their masks (m,): (m, 64), 1 or 0."""
     bits: UInt64 = (masks[:, None] >> np.arange(64, dtype=np.uint64)) & np.uint64(1)
     return bits
+
+
+def _masks(bits: Bool) -> UInt64:
+    """Masks (m,) of blocks, of which cells are in them, (m, 64)."""
+    return np.packbits(bits, axis=1, bitorder="little").view("<u8")[:, 0]
 
 
 def _new_sums(owner_count: int) -> SumArrays:

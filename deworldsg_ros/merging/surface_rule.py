@@ -12,8 +12,10 @@ import numpy as np
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.extent import NodeBoxes
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeStates
+from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.editing import (
     EditReply,
@@ -26,7 +28,7 @@ from deworldsg_ros.merging.life_cycle import LifeCycle
 from deworldsg_ros.merging.matching import Matches, match
 from deworldsg_ros.merging.records import NodeRecords, apply_correction
 from deworldsg_ros.merging.views import FrameArrays, View, frame_arrays, see, see_nothing, with_seen
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
 
@@ -61,8 +63,10 @@ class SurfaceMerging:
         )
         for stamp_ns in range(1, 4):
             spare.merge(graph, _spare_frame(stamp_ns))
-        NodeStates(graph, 1, graph.even_gaussians).refresh()
+        boxes = NodeBoxes(graph.nodes, lambda slots: spare.shown(graph.nodes, slots))
+        NodeStates(graph, 1, graph.even_gaussians, boxes).refresh()
         spare.hidden(graph)
+        spare._records.frames_before(np.zeros(3), np.zeros(3))
         spare._records.remove(graph.nodes.slot(1))
         graph.merge_nodes(1, 2)
         # Points are dropped only from nodes whose parts belong to others.
@@ -107,6 +111,14 @@ class SurfaceMerging:
     def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """See `Merging.hidden`."""
         return self._life_cycle.hidden(graph)
+
+    def shown(self, nodes: NodeTable, slots: Int64) -> Bool:
+        """See `Merging.shown`."""
+        cells, capacity = self._records.map, nodes.surface_points_world.shape[1]
+        inside = np.zeros((len(slots), capacity), np.bool_)
+        for index, slot in enumerate(slots.tolist()):
+            inside[index] = cells.points_in(cells.shown(slot), nodes, slots[index : index + 1])
+        return inside
 
     def memory(self) -> Arrays:
         """See `Merging.memory`."""

@@ -15,6 +15,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
@@ -45,6 +46,7 @@ from deworldsg_ros.relations.physics import (
 )
 from deworldsg_ros.relations.rules import settle, take_in
 from deworldsg_ros.relations.states import (
+    NEAR,
     NONE,
     RELATIONS_OF_STATE,
     STATE_COUNT,
@@ -70,6 +72,8 @@ JUDGED_A_CALL = 12
 # A prediction of a pair enters the prior of its classes if the model says, with this probability,
 # that the pair is related in this direction. Otherwise it abstains.
 MIN_RELATED = 0.5
+# Logit of a state that the measured geometry contradicts.
+CONTRADICTED_LOGIT = -60.0
 # Predictions are summed as whole numbers of this. Such sums are exact: taking a prediction back
 # leaves no trace, and the order does not matter.
 UNIT = 2.0**-40
@@ -270,6 +274,11 @@ class RobustBeliefs:
         votes, near = vote_logits(counts, pairs.rows["shown"][rows], model.votes)
         independent = unknown if self._own_head else np.ones_like(unknown)
         logits = believed_logits(model, geometry, votes, independent)
+        # Whatever the votes: what is measured to be false is not so.
+        wrong = table.contradicted(rows)
+        there, back = (_with_none(wrong[:, end])[:, RELATIONS_OF_STATE[:, end]] for end in (0, 1))
+        logits = np.where(there | back, CONTRADICTED_LOGIT, logits)
+        near = np.where(wrong[:, :, NEAR].any(axis=1), CONTRADICTED_LOGIT, near)
         worth = np.where(independent, model.source_weights[1], 1.0)
         take_in(table.scene, rows, logits, votes, near, worth)
 
@@ -317,6 +326,9 @@ class RobustBeliefs:
         )
         judged = table.beliefs["judged"][rows].repeat(2).reshape(-1, 2)
         self._add_prior(rows, probabilities, judged, prior)
+        # The prior knows only the classes.
+        wrong = _with_none(table.contradicted(rows))[:, :, self._names.relation_of]
+        probabilities[wrong] = 0.0
         visual, prior_alone, fused = range(3)
         sources = np.where(judged, np.where(voted, fused, prior_alone), visual)
         return ChangedBeliefs(gone, rows, probabilities, sources)
@@ -372,6 +384,11 @@ class RobustBeliefs:
         if found:
             self._by_classes[classes] = found
         return found
+
+
+def _with_none(contradicted: Bool) -> Bool:
+    """Of which relations the geometry contradicts, (..., NONE + 1): never "none"."""
+    return np.concatenate([contradicted, np.zeros_like(contradicted[..., :1])], axis=-1)
 
 
 def fuse_prior(
@@ -537,7 +554,12 @@ class EdgeBeliefs:
         for gone in table.gone:
             changed += [pair for pair in (gone, gone[::-1]) if self.states.pop(pair, None)]
         table.gone.clear()
-        said, mutual = said_predicates(beliefs.probabilities, beliefs.sources, self._symmetric)
+        # Messages have the geometry, too.
+        between, near = table.between(beliefs.rows)
+        cm = np.rint(100.0 * np.stack(between, axis=1)).astype(np.int64)
+        keys = np.where(near, (cm << [2, 18, 34]).sum(axis=1), 0)
+        keys = beliefs.sources + keys[:, None]
+        said, mutual = said_predicates(beliefs.probabilities, keys, self._symmetric)
         nothing = np.zeros((len(beliefs.unrelated), 2), np.int64)
         for rows, numbers in ((beliefs.unrelated, nothing), (beliefs.rows, said)):
             differ = numbers != table.beliefs["said"][rows]
@@ -600,9 +622,21 @@ class EdgeBeliefs:
         entropies = entropy_nats(visual_distribution(logits)).tolist()
         observations = pairs.rows["frames"][rows, ends].tolist()
         shown = pairs.rows["shown"][rows].tolist()
+        assert self._table is not None
+        (gap_m, rise_m, fall_m), near = self._table.between(rows)
+        back = ends > 0
+        steps = np.where(back, fall_m, rise_m), np.where(back, rise_m, fall_m)
+        measured = np.stack([gap_m, *steps], axis=1).tolist()
         return [
-            {"entropy_nats": entropy, "observations": frames, "shown": both}
-            for entropy, frames, both in zip(entropies, observations, shown)
+            {
+                "entropy_nats": e,
+                "observations": frames,
+                "shown": both,
+                "measured_m": m if n else UNSET,
+            }
+            for e, frames, both, m, n in zip(
+                entropies, observations, shown, measured, near.tolist()
+            )
         ]
 
 

@@ -11,7 +11,7 @@ from sortedcontainers import SortedList
 
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import take_first
-from deworldsg_ros.graph.pairs import Pair, PairChanges
+from deworldsg_ros.graph.pairs import Between, Pair, PairChanges, contradicted
 from deworldsg_ros.graph.publication import NEW_A_CALL
 from deworldsg_ros.relations.geometry import (
     FEATURES,
@@ -27,9 +27,9 @@ from deworldsg_ros.relations.geometry import (
 )
 from deworldsg_ros.relations.physics import PairInputs, PhysicsModel
 from deworldsg_ros.relations.rules import Scene
-from deworldsg_ros.relations.states import BELIEF, SHAPE
+from deworldsg_ros.relations.states import BELIEF, NEAR, NONE, SHAPE
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
-from deworldsg_ros.scene.vocabulary import SEATS, TABLES
+from deworldsg_ros.scene.vocabulary import CARRY_ON_TOP, SEATS, TABLES
 
 # Logit of every relation of a pair that is out of reach. The simulated rooms have none there.
 APART_LOGIT = -12.0
@@ -108,6 +108,7 @@ class PairTable:
         """Follow the vocabulary of the graph."""
         names = self._known_names = self._graph.vocabulary.classes
         self._inputs = PairInputs(names)
+        self._on_top = np.array([name in CARRY_ON_TOP for name in names], np.bool_)
         self._seating = np.array([[name in TABLES, name in SEATS] for name in names], np.float64)
 
     @property
@@ -131,6 +132,31 @@ class PairTable:
         rows = self._graph.pairs.of(slots)
         known: Int64 = rows[self.beliefs["known"][rows]]
         return known
+
+    def between(self, rows: Int64) -> tuple[Between, Bool]:
+        """Geometry (m,) of pairs, the first node to the second; and which are in reach, (m,) bool.
+
+        In whole centimetres, so that a tiny change makes no new message.
+        """
+        beliefs, (one, other) = self.beliefs, self.shapes[self._graph.pairs.rows["slots"][rows].T]
+        near = beliefs["judged"][rows] & np.isfinite(beliefs["gap_m"][rows])
+        apart = np.maximum(one["low"] - other["high"], other["low"] - one["high"])[:, :2]
+        gaps = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
+        steps = one["low"][:, 2] - other["high"][:, 2], other["low"][:, 2] - one["high"][:, 2]
+        return Between(*(np.rint(100.0 * values) / 100.0 + 0.0 for values in (gaps, *steps))), near
+
+    def contradicted(self, rows: Int64) -> Bool:
+        """Which relations the geometry of pairs contradicts, (m, 2, NONE), by direction.
+
+        Out of reach, nothing touches.
+        """
+        between, near = self.between(rows)
+        on_top = self._on_top[self.classes(rows)]
+        there = contradicted(between, on_top[:, 1])
+        back = contradicted(Between(between[0], between[2], between[1]), on_top[:, 0])
+        apart = self.beliefs["judged"][rows, None, None] & (np.arange(NONE) != NEAR)
+        both = np.stack([there, back], axis=1)
+        return np.asarray(np.where(near[:, None, None], both, apart))
 
     def classes(self, rows: Int64) -> Int64:
         """The most probable class (k, 2) of both nodes of pairs."""

@@ -8,7 +8,7 @@ from typing import Annotated, Protocol
 
 import msgspec
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.graph.graph import GlobalGraph
@@ -491,6 +491,7 @@ def edge_state(
     observations: int,
     shown: int | None = None,
     mutual: bool = False,
+    measured_m: list[float] | UnsetType = UNSET,
 ) -> wire.EdgeState:
     """The message of an edge with the probabilities of its predicates."""
     return wire.EdgeState(
@@ -505,4 +506,5 @@ def edge_state(
         remainder=told.remainder,
         shown=UNSET if shown is None else shown,
         mutual=mutual or UNSET,
+        measured_m=measured_m,
     )

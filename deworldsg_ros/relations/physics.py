@@ -241,9 +241,9 @@ def believed_logits(
 ) -> Float64:
     """Logits of the states of pairs from both sources.
 
-    A fraction of surfaces is broken: masks bleed, and nodes merge. Geometry therefore never
-    excludes a state. The embedded relation head errs where the geometry is misleading: beside
-    geometry, its votes are worth less than independent ones.
+    A fraction of surfaces is broken: masks bleed, and nodes merge. Judged geometry therefore never
+    excludes a state; `PairTable.contradicted` does. The embedded relation head errs where the
+    geometry is misleading: beside geometry, its votes are worth less than independent ones.
 
     Args:
         model: its prior and its source weights are used.

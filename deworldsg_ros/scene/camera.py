@@ -428,10 +428,11 @@ class UpEstimator:
         """
         most = self._known_count if exact else self._known_count * (1 + _NEW_POSES)
         if self._known is None or not self._known_count <= self._count <= most:
-            self._known, self._known_count = self._estimate(), self._count
+            self._known, self._known_count = self.estimate(), self._count
         return self._known
 
-    def _estimate(self) -> Float64:
+    def estimate(self) -> Float64:
+        """`up_world` of all poses so far, as if nobody had asked for it before."""
         if self._axis != "auto":
             return np.array(AXES[self._axis])
         z = np.array(AXES["z"])

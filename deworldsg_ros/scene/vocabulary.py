@@ -46,6 +46,10 @@ KINDS: tuple[frozenset[str], ...] = (
     TABLES, SEATS, STORAGE, CONTAINERS, PLANTS, ON_WALLS, SCREENS, SOFT, FLAT, BEDS,
 )  # fmt: skip
 
+# Tables, appliances and flat things carry on their tops. Seats and shelves, beds and containers
+# carry below their highest point. So may what is not known here.
+CARRY_ON_TOP = TABLES | FLAT | {"oven", "refridgerator", "refrigerator", "microwave", "toaster"}
+
 # Classes of the objects that a class is fixed to.
 FIXED_TO = {
     "sink": frozenset({"counter", "cabinet", "table"}),

@@ -105,6 +105,7 @@ def _node(item: SceneObject, colour: str, axes_of_view: Float64) -> dict[str, An
         "observations": item.observations,
         "position": np.round(item.position_m, 3).tolist(),
         "size": np.round(item.size_m, 3).tolist(),
+        "sizeWords": item.size_words,
         "centre": np.round(axes_of_view @ item.position_m, 4).tolist(),
         # Columns of the rotation, one after the other.
         "axes": np.round((axes_of_view @ rotation).T, 4).ravel().tolist(),

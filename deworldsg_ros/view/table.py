@@ -45,7 +45,7 @@ def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
             _name(node.label, node.id, Style(color=colours[node.label])),
             _percent(node.classes[0].probability) if node.classes else "",
             " ".join(f"{value:6.2f}" for value in item.position_m),
-            " × ".join(f"{100 * value:.0f}" for value in item.size_m),
+            " × ".join(item.size_words),
             str(node.observations),
         )
     return table

@@ -119,13 +119,10 @@ Vector3 = Annotated[
     list[Annotated[float, msgspec.Meta(ge=-MAX_GRAPH_COORDINATE_M, le=MAX_GRAPH_COORDINATE_M)]],
     msgspec.Meta(min_length=3, max_length=3),
 ]
+_AXES = "along the axes of the box; the third one is up"
 Size3 = Annotated[
     list[Annotated[float, msgspec.Meta(ge=0.0, le=2 * MAX_GRAPH_COORDINATE_M)]],
-    msgspec.Meta(
-        min_length=3,
-        max_length=3,
-        description="along the axes of the box; the third one is up",
-    ),
+    msgspec.Meta(min_length=3, max_length=3, description=_AXES),
 ]
 Matrix3 = Annotated[
     list[Annotated[float, msgspec.Meta(ge=-MAX_GRAPH_VARIANCE_M2, le=MAX_GRAPH_VARIANCE_M2)]],
@@ -373,6 +370,13 @@ class GravityBox(msgspec.Struct, frozen=True, gc=False):
         list[UnitPart],
         msgspec.Meta(min_length=4, max_length=4, description="axes of the box to world, unit"),
     ]
+    at_least: Annotated[
+        Union[Annotated[list[bool], msgspec.Meta(min_length=3, max_length=3)], msgspec.UnsetType],
+        msgspec.Meta(
+            description="sides of size_m that no view shows to their end: the object may be "
+            "longer; absent = none, or not known"
+        ),
+    ] = msgspec.UNSET
 
 
 class NodeState(msgspec.Struct, frozen=True, gc=False):
@@ -441,6 +445,12 @@ class HiddenNode(msgspec.Struct, frozen=True):
 
 
 Provenance = Literal["visual", "prior", "fused"]
+Measured = Annotated[
+    Union[Vector3, msgspec.UnsetType],
+    msgspec.Meta(
+        description="horizontal gap; bottom of subject above top of object, and the opposite"
+    ),
+]
 
 
 class EdgeState(msgspec.Struct, frozen=True, gc=False):
@@ -484,14 +494,13 @@ class EdgeState(msgspec.Struct, frozen=True, gc=False):
         Union[NonNegative, msgspec.UnsetType],
         msgspec.Meta(description="frames that showed both objects, when this was computed"),
     ] = msgspec.UNSET
+    measured_m: Measured = msgspec.UNSET
 
 
 Up = Annotated[
     Union[Annotated[list[UnitPart], msgspec.Meta(min_length=3, max_length=3)], msgspec.UnsetType],
     msgspec.Meta(description="unit vector against gravity in the world frame"),
 ]
-
-
 # Sequence numbers start again with each session.
 Session = Annotated[
     Union[Name, msgspec.UnsetType],
@@ -605,8 +614,8 @@ def encode(message: Message) -> str:
 
 def max_bytes(kind: type[Message]) -> int:
     """Size of the largest message of this type that is read."""
-    is_graph = kind in (SceneGraphMessage, SceneGraphUpdateMessage, EmbeddingsMessage)
-    return MAX_GRAPH_BYTES if is_graph else MAX_FRAME_BYTES
+    graphs = SceneGraphMessage, SceneGraphUpdateMessage, EmbeddingsMessage
+    return MAX_GRAPH_BYTES if kind in graphs else MAX_FRAME_BYTES
 
 
 def decode(text: Union[str, bytes], kind: type[M], most_bytes: Optional[int] = None) -> M:
@@ -633,25 +642,22 @@ def decode(text: Union[str, bytes], kind: type[M], most_bytes: Optional[int] = N
     # UnicodeError: text that is no UTF-8. RecursionError: nested deeper than the interpreter.
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
-    known = schema_of(kind)
-    if message.schema.name != known.name or message.schema.version > known.version:
+    known, found = schema_of(kind), message.schema
+    if found.name != known.name or found.version > known.version:
         raise RefusedInput(
             "unknown_schema",
-            f"message is {message.schema.name!r} version {message.schema.version}: "
-            f"expected {known.name} version {known.version} or older",
+            f"message is {found.name!r} version {found.version}: expected {known.name} version "
+            f"{known.version} or older",
         )
     checked_frame_id(message.frame_id)
-    if isinstance(message, EmbeddingsMessage):
-        try:
+    try:
+        if isinstance(message, EmbeddingsMessage):
             check_labels([message.model])
             _check_once("node", [node.id for node in message.nodes])
-        except ValueError as error:
-            raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
-    if isinstance(message, (SceneGraphMessage, SceneGraphUpdateMessage)):
-        try:
+        elif isinstance(message, (SceneGraphMessage, SceneGraphUpdateMessage)):
             _check_graph(message)
-        except ValueError as error:
-            raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
+    except ValueError as error:
+        raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
     return message
 
 
@@ -659,8 +665,8 @@ def _check_graph(message: Union[SceneGraphMessage, SceneGraphUpdateMessage]) -> 
     """Check text, unit lengths and ids of a graph, which no schema can. Raises ValueError."""
     nodes, edges = message.nodes, message.edges
     labels = {node.label for node in nodes} | {edge.predicate for edge in edges}
-    labels.update(belief.label for node in nodes for belief in node.classes)
-    labels.update(belief.label for edge in edges for belief in edge.predicates)
+    listed = [node.classes for node in nodes] + [edge.predicates for edge in edges]
+    labels.update(belief.label for beliefs in listed for belief in beliefs)
     if isinstance(message, SceneGraphMessage) and isinstance(message.hidden, list):
         labels.update(text for node in message.hidden for text in (node.label, node.reason))
     check_labels(sorted(labels))
@@ -690,5 +696,5 @@ def _check_once(name: str, items: list[Any]) -> None:
 
 def json_schema(kind: type[Message]) -> dict[str, Any]:
     """JSON Schema (2020-12) of a message."""
-    schema = msgspec.json.schema(kind)
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
+    return {**head, **msgspec.json.schema(kind)}

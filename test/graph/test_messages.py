@@ -10,6 +10,7 @@ from support.merging import VOCABULARY, node_states
 from deworldsg_ros.graph.extent import (
     box_of,
     even_moments,
+    extents_of,
     horizontal_axes,
     rounded,
     surface_bytes,
@@ -121,6 +122,26 @@ def test_a_box_is_found_in_every_world(up, heading) -> None:
     assert rotation[:, 2] == pytest.approx(np.array(up) / np.linalg.norm(up), abs=1e-3)
     inside = np.abs((points - box.center_m) @ rotation) <= np.array(box.size_m) / 2 + 2e-3
     assert inside.all(axis=1).mean() > 0.98
+
+
+def test_a_box_is_along_the_sides_that_are_seen_and_around_the_main_parts() -> None:
+    rng, length, depth = np.random.default_rng(3), 0.7, 0.6
+    # Front and one side of a cabinet: the rectangle along the diagonal is as small. And a part of
+    # the floor.
+    front = np.column_stack([rng.uniform(0, length, 200), np.zeros(200), rng.uniform(0, 1, 200)])
+    side = np.column_stack([np.zeros(150), rng.uniform(0, depth, 150), rng.uniform(0, 1, 150)])
+    floor = rng.uniform((1.2, 0.0, 0.0), (1.4, 0.2, 0.0), (20, 3))
+    points = np.concatenate([front, floor, side]).astype(np.float32)[None]
+    known = points, np.array([370]), np.array([0]), Z
+    (extent,) = extents_of(*known, np.ones((1, 370), np.bool_))
+    assert extent.box.size_m == pytest.approx([length, depth, 1.0], abs=0.02)
+    # Points that the images do not show as the object's are outside.
+    shown = np.arange(370)[None] < 200
+    (thin,) = extents_of(*known, shown)
+    assert sorted(thin.box.size_m[:2]) == pytest.approx([0.0, length], abs=0.02)
+    # Without images, as with the paper's rule: the smallest box, around everything.
+    (smallest,) = extents_of(*known)
+    assert max(smallest.box.size_m) > 1.1
 
 
 def test_few_points_and_points_at_nearly_one_place_have_a_box() -> None:

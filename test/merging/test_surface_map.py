@@ -15,12 +15,14 @@ from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
 from deworldsg_ros.merging import SurfaceMerging
-from deworldsg_ros.merging.cell_kernels import MIN_OWNER_CELLS, CellSets
+from deworldsg_ros.merging.cell_kernels import MIN_OWNER_CELLS, SHOWN, SURFACE, CellSets
 from deworldsg_ros.merging.surface_map import (
     CELL_M,
     HIT,
+    HIT_SHOWN,
     MAX_SCORE,
     MISS,
+    MISS_SHOWN,
     SHOWN_FRACTION,
     SHOWN_M,
     VoxelMap,
@@ -28,6 +30,7 @@ from deworldsg_ros.merging.surface_map import (
 from deworldsg_ros.merging.views import frame_arrays
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
+from deworldsg_ros.wire import messages as wire
 
 seeds = st.integers(0, 10**6)
 SHAPE = (60, 80)
@@ -118,10 +121,11 @@ def test_room_is_limited() -> None:
 
 
 class PlainScores:
-    """The same rule for one owner, cell by cell."""
+    """The same rule for one owner, cell by cell: both scores."""
 
     def __init__(self) -> None:
         self.scores: dict[Cell, int] = {}
+        self.shown: dict[Cell, int] = {}
 
     def judge(self, own: set[Cell], value: int, T: np.ndarray, grid: DepthGrid) -> set[Cell]:
         """Takes in the cells of a frame; returns those that it rejects."""
@@ -129,7 +133,11 @@ class PlainScores:
         for cell in own:
             self.scores.setdefault(cell, 0)
         for cell, score in self.scores.items():
-            hit = True if cell in own else shows(cell, value, T, grid)
+            shown = shows(cell, value, T, grid)
+            if shown is not None:
+                sum_ = self.shown.get(cell, 0) + (HIT_SHOWN if shown else -MISS_SHOWN)
+                self.shown[cell] = int(np.clip(sum_, -MAX_SCORE, MAX_SCORE))
+            hit = True if cell in own else shown
             if hit is not None:
                 change = HIT if hit else -MISS
                 self.scores[cell] = int(np.clip(score + change, -MAX_SCORE, MAX_SCORE))
@@ -166,10 +174,10 @@ def indices(block: int, mask: int) -> list[tuple[int, Cell]]:
     ]
 
 
-def scores_of(surfaces: VoxelMap, owner: int) -> dict[Cell, int]:
+def scores_of(surfaces: VoxelMap, owner: int, kind: int = SURFACE) -> dict[Cell, int]:
     blocks, masks, _ = surfaces.cells(owner)
     return {
-        index: int(scores[bit])
+        index: int(scores[kind, bit])
         for block, mask, scores in zip(blocks.tolist(), masks.tolist(), surfaces.scores(owner))
         for bit, index in indices(block, mask)
     }
@@ -204,6 +212,8 @@ def test_scores_equal_the_reference(seed: int) -> None:
         for owner in (0, 1):
             expected = plain[owner].judge(cells_of(points[owner], CELL_M), owner + 1, T, grid)
             assert scores_of(surfaces, owner) == plain[owner].scores
+            shown = {cell: plain[owner].shown.get(cell, 0) for cell in plain[owner].scores}
+            assert scores_of(surfaces, owner, SHOWN) == shown
             assert cells_in(rejected, owner) == expected
 
 
@@ -295,6 +305,29 @@ def test_what_is_inside_all_masks_stays() -> None:
     assert deviation_m == pytest.approx(2 * TRUE_M / 12**0.5, rel=0.1)
 
 
+def box_after(*half_widths_m: float) -> wire.GravityBox:
+    builder = GraphBuilder(Config(), VOCABULARY, "world")
+    for local in views(*half_widths_m):
+        builder.integrate(local)
+    (node,) = builder.full().nodes
+    return node.box
+
+
+def test_a_box_is_around_what_the_images_show_as_the_object() -> None:
+    # Two frames of three are enough for the surface, and too few for the box.
+    masks_m = [WIDE_M, WIDE_M, TRUE_M] * 6
+    assert merged(*views(*masks_m))[1][-1] > 0.9 * WIDE_M
+    assert box_after(*masks_m).size_m[0] == pytest.approx(2 * TRUE_M, abs=0.03)
+
+
+def test_a_side_that_no_view_shows_to_its_end_may_be_longer() -> None:
+    # The back of a picture is never seen; a wider one is cut by the border of the image.
+    assert box_after(*[TRUE_M] * 8).at_least == [False, True, False]
+    assert box_after(*[1.2] * 8).at_least == [True, True, False]
+    # Two frames that show the ends are enough.
+    assert box_after(*[1.2] * 4, *[0.9] * 40).at_least == [False, True, False]
+
+
 def test_without_a_detection_or_an_instance_image_the_surface_stays() -> None:
     frames = views(WIDE_M, TRUE_M, TRUE_M, instances=False)
     blind = [frame(n, (one.surface_points_world[0], TABLE)) for n, one in enumerate(frames)]
@@ -322,6 +355,11 @@ def test_a_map_continues_the_evidence(tmp_path: Path) -> None:
             one, other = again.graph.state(), whole.graph.state()
             np.testing.assert_array_equal(one.surface_points, other.surface_points)
             np.testing.assert_array_equal(one.surface_counts, other.surface_counts)
+    # An older release has one score of a cell.
+    arrays = graph_files.read(path)
+    arrays["merging.scores"] = np.ascontiguousarray(arrays["merging.scores"][:, SURFACE])
+    graph_files.write(path, arrays)
+    assert read_map(config, path).merging.memory()["scores"].shape[1:] == (2, 64)
     # A map of an older release starts without evidence.
     arrays = graph_files.read(path)
     for name in ("scores", "records", "looks", "fates", "frames"):

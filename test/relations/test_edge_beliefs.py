@@ -131,6 +131,25 @@ def test_a_table_is_with_its_chairs_and_they_are_near_it() -> None:
     assert all(edge.predicate != "with" for edge in edges_of(builder).values())
 
 
+def test_votes_cannot_say_what_the_geometry_contradicts() -> None:
+    def said_on(label: str, x: float, z: float) -> wire.EdgeState | None:
+        things = {"holder": thing(label, 0, 0, 0, 0.6, 0.6, 1.7)}
+        builder, ids = room({**things, "bowl": thing("bowl", x, 0, z, 0.2, 0.2, 0.1)}, config())
+        vote(builder, ids["bowl"], ids["holder"], "on", 300)
+        edge = edges_of(builder).get((ids["bowl"], ids["holder"]))
+        return edge if edge is not None and edge.predicate == "on" else None
+
+    # A refrigerator carries on its top, and a couch below it.
+    high = said_on("refrigerator", 0, 1.7)
+    assert high is not None and high.measured_m == pytest.approx([0, 0, -1.8], abs=0.06)
+    low = said_on("couch", 0, 0.85)
+    assert low is not None and low.measured_m == pytest.approx([0, -0.85, -0.95], abs=0.06)
+    assert said_on("refrigerator", 0, 0.85) is None
+    # Nothing is on what is beside it, or far away.
+    assert said_on("couch", 0.65, 0.85) is None
+    assert said_on("couch", 1.5, 0.85) is None
+
+
 def test_where_beliefs_come_from() -> None:
     builder, pair = desk()
     assert edges_of(builder)[pair].provenance == "prior"
@@ -157,7 +176,7 @@ def test_messages_have_the_entropy_and_frames_of_the_visual_evidence() -> None:
 
 def test_votes_of_another_relation_head_count_more() -> None:
     def of(head: str) -> float:
-        builder, ids = room({"table": table(0, 0), "chair": chair(0, 0.9)}, config(head))
+        builder, ids = room({"table": table(0, 0), "chair": chair(0, 0.68)}, config(head))
         vote(builder, ids["chair"], ids["table"], "against", 20)
         found = beliefs_of(builder, config(head))[ids["chair"], ids["table"]]
         return float(found[PREDICATES.index("against")])

@@ -267,7 +267,7 @@ function showCard(id) {
   for (const [term, text] of [
     ["class", classes.join(", ")],
     ["is an object", node.existence === null ? null : percent(node.existence)],
-    ["size", `${node.size.map(side => (100 * side).toFixed(0)).join(" × ")} cm`],
+    ["size", `${node.sizeWords.join(" × ")} cm`],
     ["colour", node.looks],
     ["position", `${node.position.map(value => value.toFixed(2)).join(", ")} m`],
     ["seen in", `${node.observations} frame${node.observations === 1 ? "" : "s"}`],

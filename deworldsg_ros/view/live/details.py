@@ -54,14 +54,15 @@ def object_html(item: SceneObject, relations: Sequence[Relation], photo: bytes |
     """
     seconds = (item.last_seen_ns - item.first_seen_ns) / 1e9
     position = ", ".join(f"{value:.2f}" for value in item.position_m)
-    size = " × ".join(f"{100 * side:.0f}" for side in item.size_m)
+    size = " × ".join(item.size_words)
+    unseen = "; not seen to the end: ≥" if item.is_partly_seen else ""
     facts = {
         "exists": ""
         if item.existence is None
         else f"{item.existence:.0%} ({odds_of(item.existence)})",
         "class": uncertainty(item),
         "looks": f"{counted(item.observations, 'frame')} over {seconds:.1f} s",
-        "size": f"{size} cm (length, width, height)",
+        "size": f"{size} cm (length, width, height{unseen})",
         "colour": item.colour or "",
         "place": f"{position} m",
     }
