@@ -23,8 +23,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from segmenter_iou import Frame, grab_cut
 
+from deworldsg_ros.perception.backends.embedded import NanoDetDetector
 from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
-from deworldsg_ros.perception.backends.nanodet import NanoDetDetector
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 from deworldsg_ros.perception.protocols import SegmentedObjects
 from deworldsg_ros.perception.stage import instance_image

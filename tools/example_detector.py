@@ -13,7 +13,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
 
-from deworldsg_ros.perception.backends.nanodet import NanoDetDetector  # put yours here
+from deworldsg_ros.perception.backends.embedded import NanoDetDetector  # put yours here
 
 
 class ExampleDetector(Node):

@@ -26,6 +26,7 @@ from deworldsg_ros.scene.errors import EvaluationError
 
 # Names of backends and world models, as the literature writes them.
 NAMES = {
+    "pair": "NanoDet and SSDLite",
     "nanodet": "NanoDet",
     "rtdetr": "RT-DETR",
     "rgbd": "RGB-D masks",

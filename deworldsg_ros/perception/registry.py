@@ -24,8 +24,14 @@ from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
 Made = TypeVar("Made")
 
 
+def _pair(config: PerceptionConfig) -> Detector:
+    from deworldsg_ros.perception.backends.embedded import PairDetector
+
+    return PairDetector(threads=config.threads)
+
+
 def _nanodet(config: PerceptionConfig) -> Detector:
-    from deworldsg_ros.perception.backends.nanodet import NanoDetDetector
+    from deworldsg_ros.perception.backends.embedded import NanoDetDetector
 
     return NanoDetDetector(threads=config.threads)
 
@@ -109,6 +115,7 @@ def _embedder(config: PerceptionConfig) -> Embedder:
 
 
 DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
+    "pair": _pair,
     "nanodet": _nanodet,
     "transformers": _transformers,
     # The same, by the name of the paper's detector.
@@ -119,7 +126,7 @@ DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
 }
 # Torch has one setting of its threads for the thread that sets it, and a GPU takes one frame after
 # the other anyway.
-THREAD_SAFE_DETECTORS = {"nanodet", "onnx"}
+THREAD_SAFE_DETECTORS = {"pair", "nanodet", "onnx"}
 SEGMENTERS: dict[str, Callable[[PerceptionConfig], Segmenter]] = {
     "rgbd": _rgbd,
     "sam2": _sam2,

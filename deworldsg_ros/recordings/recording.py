@@ -20,6 +20,7 @@ from deworldsg_ros.recordings.folders.dataset import (
     expectations,
     open_dataset,
 )
+from deworldsg_ros.recordings.folders.frame_files import FrameFiles
 from deworldsg_ros.recordings.source import Role, Source
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RecordingError
@@ -69,6 +70,7 @@ class Recording:
             topics={role.value: topic.name for role, topic in source.topics.items()},
             on_drop=self._remember,
             with_detections=with_detections,
+            sparse=isinstance(source, FrameFiles) and source.are_sparse(),
         )
 
     @property

@@ -314,6 +314,7 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         on_drop: called with the reason, a message and the number of items of each drop.
         with_detections: whether each image waits for the detections of another process; one
             without is dropped.
+        sparse: whether the frames are single pictures, see `JumpGate`.
 
     Attributes:
         drops: number of dropped items by reason.
@@ -328,10 +329,12 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         max_wait_s: float = 2.0,
         on_drop: OnDrop | None = None,
         with_detections: bool = False,
+        sparse: bool = False,
     ) -> None:
         others = ("detections",) if with_detections else ()
         super().__init__("rgb", others, inputs, topics, capacity, max_wait_s, on_drop)
-        self._gate = JumpGate()
+        self._sparse = sparse
+        self._gate = JumpGate(sparse)
         self._detections: Stream[DetectionsMessage] | None = self._others.get("detections")
         # The instance image is optional: images wait for it after the first one.
         name = "detection_instances"
@@ -355,7 +358,7 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         super()._restart(stamp_ns)
         if self._instances.restarts(stamp_ns):
             self._instances.clear()
-        self._gate = JumpGate()
+        self._gate = JumpGate(self._sparse)
 
     def _settled(self, stamp_ns: int, value: Any) -> bool:
         if self._detections is None:
@@ -368,7 +371,7 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         T_world_camera, frame_id = self._source().at(stamp_ns, self.camera_frame)
         decode_depth = self._depth_at(stamp_ns)
         decode_sent = self._sent_at(stamp_ns, intrinsics)
-        self._gate.check(T_world_camera, stamp_ns)
+        self._gate.check(T_world_camera, stamp_ns, (decode_depth, intrinsics))
 
         def decode() -> RgbdFrame:
             depth_m, rgb = decode_depth(), rgb_from_message(value)

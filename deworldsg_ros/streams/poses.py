@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_left
+from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.camera import (
+    Intrinsics,
     check_pose,
     interpolate_pose,
     invert_pose,
@@ -501,27 +503,56 @@ MAX_ROTATION_DEG_S = 360.0
 MIN_INTERVAL_S = 1 / 15
 # Half a second at 10 Hz: longer than a tracker's usual slip, short enough after a relocalisation.
 RELOCALISED_AFTER_FRAMES = 5
+# Two depth images can be compared if this fraction of the pixels of each lies in the other. They
+# show one place if this fraction of these has the other's depth, up to a constant and a part of the
+# depth; they contradict each other if this fraction lies where the other sees free space.
+SHARED_FRACTION, AGREED_FRACTION, CONTRADICTED_FRACTION = 0.2, 0.6, 0.3
+DEPTH_TOLERANCE_M, DEPTH_TOLERANCE_FRACTION = 0.05, 0.03
+# Every so many pixels, in both directions, one is compared.
+COMPARED_STEP = 8
+
+# Decodes a depth image in metres, (H, W) float32, 0 = invalid; and its camera.
+DepthView = tuple[Callable[[], Float32], Intrinsics]
 
 
 class JumpGate:
     """Refuses a frame whose camera jumped; accepts a new position that persists.
 
     A frame jumped if, since the last accepted frame, the camera moved more than `MAX_STEP_M` or
-    rotated faster than `MAX_ROTATION_DEG_S`. After `RELOCALISED_AFTER_FRAMES` consecutive frames
-    without a jump between them, the tracker has relocalised and the new position is accepted.
+    rotated faster than `MAX_ROTATION_DEG_S`. Sparse pictures do so, too: if both depth images show
+    the same surfaces under the poses, it is no jump. After `RELOCALISED_AFTER_FRAMES` consecutive
+    frames without a jump between them, the tracker has relocalised and the new position is
+    accepted.
+
+    Args:
+        sparse: whether the frames are pictures without stamps. Their steps may be of any size:
+            only a jump that depth contradicts is one.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, sparse: bool = False) -> None:
+        self._sparse = sparse
         self._accepted: tuple[int, Float64] | None = None
+        self._view: DepthView | None = None
         self._candidate: tuple[int, Float64] | None = None
         self._consistent_frames = 0
 
-    def check(self, T_world_camera: Float64, stamp_ns: int) -> None:
-        """Accept the pose (4, 4) of a frame; raises RefusedInput ``pose_jump`` for a jump."""
+    def check(self, T_world_camera: Float64, stamp_ns: int, view: DepthView | None = None) -> None:
+        """Accept a frame.
+
+        Args:
+            T_world_camera: (4, 4).
+            stamp_ns: of the frame.
+            view: its depth, which is decoded if the camera may have jumped.
+
+        Raises:
+            RefusedInput: ``pose_jump``.
+        """
         pose = (stamp_ns, T_world_camera.copy())
-        jump = _jump(self._accepted, pose) if self._accepted else ""
-        if jump:
-            is_consistent = self._candidate is not None and not _jump(self._candidate, pose)
+        jump = unlikely_motion(self._accepted, pose) if self._accepted else ""
+        if jump and not self._is_confirmed(pose, view):
+            is_consistent = self._candidate is not None and not unlikely_motion(
+                self._candidate, pose
+            )
             self._consistent_frames = self._consistent_frames + 1 if is_consistent else 1
             self._candidate = pose
             if self._consistent_frames < RELOCALISED_AFTER_FRAMES:
@@ -530,13 +561,34 @@ class JumpGate:
                     f"camera {jump}, or {RELOCALISED_AFTER_FRAMES} consistent frames at the new "
                     f"position (this is number {self._consistent_frames}). Check the localisation",
                 )
-        self._accepted = pose
+        self._accepted, self._view = pose, view
         self._candidate = None
         self._consistent_frames = 0
 
+    def _is_confirmed(self, pose: tuple[int, Float64], view: DepthView | None) -> bool:
+        """Whether the depth of the last accepted frame and of this one agrees with a wide step."""
+        if self._accepted is None or self._view is None or view is None:
+            return False
+        try:
+            before, now = self._view[0](), view[0]()
+        except RefusedInput:
+            return False
+        T_before_now = invert_pose(self._accepted[1]) @ pose[1]
+        there = _compare(now, view[1], T_before_now, before, self._view[1])
+        back = _compare(before, self._view[1], invert_pose(T_before_now), now, view[1])
+        if min(there[0], back[0]) < SHARED_FRACTION:
+            return self._sparse
+        contradicted = max(there[2], back[2])
+        if self._sparse:
+            return contradicted < CONTRADICTED_FRACTION
+        # What is near hides more of the other image in one of the two directions.
+        agreed = sorted((there[1], back[1]))
+        is_agreed = agreed[1] >= AGREED_FRACTION and agreed[0] >= AGREED_FRACTION / 2
+        return is_agreed and contradicted < CONTRADICTED_FRACTION / 3
 
-def _jump(before: tuple[int, Float64], now: tuple[int, Float64]) -> str:
-    """Which limit two poses exceed, in words; empty for a plausible motion."""
+
+def unlikely_motion(before: tuple[int, Float64], now: tuple[int, Float64]) -> str:
+    """Which limit the motion between two stamps and poses exceeds, in words; empty for none."""
     step_m = float(np.linalg.norm(now[1][:3, 3] - before[1][:3, 3]))
     if step_m > MAX_STEP_M:
         return (
@@ -550,3 +602,38 @@ def _jump(before: tuple[int, Float64], now: tuple[int, Float64]) -> str:
             f"frame: expected at most {MAX_ROTATION_DEG_S:g} a second"
         )
     return ""
+
+
+def _compare(
+    depth_m: Float32,
+    camera: Intrinsics,
+    T_other_camera: Float64,
+    other_depth_m: Float32,
+    other: Intrinsics,
+) -> tuple[float, float, float]:
+    """Of the pixels of a depth image, the fraction that lies in another one; of these, those at its
+    depth, and those before it, where it sees free space.
+    """
+    rows, columns = np.mgrid[: depth_m.shape[0] : COMPARED_STEP, : depth_m.shape[1] : COMPARED_STEP]
+    z = depth_m[rows, columns].astype(np.float64)
+    valid = z > 0
+    rays = [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(z.shape)]
+    points = np.stack(rays)[:, valid] * z[valid]
+    x, y, z = T_other_camera[:3, :3] @ points + T_other_camera[:3, 3:]
+    front = z > 0
+    x, y, z = x[front], y[front], z[front]
+    u = np.rint(other.fx * x / z + other.cx)
+    v = np.rint(other.fy * y / z + other.cy)
+    height, width = other_depth_m.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    seen = other_depth_m[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+    z, seen = z[inside][seen > 0], seen[seen > 0]
+    if not len(z):
+        return 0.0, 0.0, 0.0
+    tolerance = DEPTH_TOLERANCE_M + DEPTH_TOLERANCE_FRACTION * z
+    shared = len(z) / np.count_nonzero(valid)
+    return (
+        shared,
+        float(np.mean(np.abs(seen - z) < tolerance)),
+        float(np.mean(z + tolerance < seen)),
+    )

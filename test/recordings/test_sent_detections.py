@@ -17,7 +17,8 @@ from deworldsg_ros.recordings.writer import write_mcap
 from deworldsg_ros.scene.errors import RecordingError, RefusedInput
 
 FRAMES = 40
-TOPIC = Config(perception=PerceptionConfig(detector="topic"))
+# The embedded detector's threshold.
+TOPIC = Config(perception=PerceptionConfig(detector="topic", score_threshold=0.5))
 
 
 @pytest.fixture(scope="module")

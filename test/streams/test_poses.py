@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.recordings import tf
 from support.streams import MS, T0, at
 
-from deworldsg_ros.scene.camera import invert_pose
+from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import (
     MAX_FRAMES,
@@ -107,6 +107,50 @@ def test_jumps_are_refused_until_they_are_a_new_place(xs, turns_deg, step_ms, ex
         except RefusedInput as refusal:
             seen.append(refusal.reason)
     assert seen == expected
+
+
+CAMERA = Intrinsics(200.0, 200.0, 159.5, 119.5, 320, 240)
+
+
+def view_of_a_room(T_world_camera):
+    """Depth of the walls of a room of 6 x 4 x 3 m, seen from inside, with a box in its middle."""
+    v, u = np.mgrid[:240, :320]
+    rays = np.stack([(u - 159.5) / 200, (v - 119.5) / 200, np.ones(u.shape)], axis=-1)
+    directions = rays @ T_world_camera[:3, :3].T + 1e-9
+    eye, half = T_world_camera[:3, 3], np.array([3.0, 2.0, 1.5])
+    walls = np.maximum((-half - eye) / directions, (half - eye) / directions).min(axis=-1)
+    sides = np.stack([(-half / 5 - eye) / directions, (half / 5 - eye) / directions])
+    near, far = sides.min(axis=0).max(axis=-1), sides.max(axis=0).min(axis=-1)
+    depth = np.where((near < far) & (near > 0), near, walls).astype(np.float32)
+    return lambda: depth, CAMERA
+
+
+@pytest.mark.parametrize(("sparse", "alone"), [(False, JUMP), (True, OK)])
+def test_a_wide_step_is_no_jump_if_the_depth_agrees(sparse, alone):
+    def step(pose, true_pose, with_depth=True):
+        gate = JumpGate(sparse)
+        gate.check(start, T0, view_of_a_room(start))
+        try:
+            gate.check(pose, T0 + 33 * MS, view_of_a_room(true_pose) if with_depth else None)
+        except RefusedInput as refusal:
+            return refusal.reason
+        return OK
+
+    def eye(x, y=0.0, turn_rad=0.0):
+        forward = np.eye(4)
+        forward[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+        return at(x, y, turn_rad) @ forward
+
+    start = eye(-2.5)
+    wide, turned = eye(-1.2), eye(-2.5, turn_rad=0.5)
+    assert step(wide, wide) == step(turned, turned) == OK
+    # The pose says that the camera moved, and its image that it did not; or the reverse.
+    assert step(eye(-1.2), start) == JUMP
+    assert step(eye(-2.5, turn_rad=0.6), eye(-2.5, turn_rad=-0.4)) == JUMP
+    assert step(wide, wide, with_depth=False) == JUMP
+    # The images have nothing in common.
+    behind = eye(-2.5, turn_rad=math.pi)
+    assert step(behind, behind) == alone
 
 
 def add(tree: TransformTree, stamp_ns: int, pairs: str, T: np.ndarray | None = None, static=False):

@@ -20,7 +20,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from deworldsg_ros.perception.backends.nanodet import (
+from deworldsg_ros.perception.backends.embedded import (
     CALIBRATION,
     NanoDetDetector,
     SoftmaxCalibration,

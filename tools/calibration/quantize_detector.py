@@ -36,7 +36,7 @@ from onnxruntime.quantization.shape_inference import quant_pre_process
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from deworldsg_ros.perception.backends.nanodet import BINS, INPUT_SIZE, STRIDES, letterbox
+from deworldsg_ros.perception.backends.embedded import BINS, INPUT_SIZE, STRIDES, letterbox
 from deworldsg_ros.scene.vocabulary import COCO_CLASSES
 
 # Of the training images, BGR, 8-bit scale.

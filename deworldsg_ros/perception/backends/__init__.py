@@ -1,3 +1,3 @@
-"""Detectors (`nanodet`, `closed_set`, `open_vocabulary`), segmenters (`rgbd`, `sam`), relation
+"""Detectors (`embedded`, `closed_set`, `open_vocabulary`), segmenters (`rgbd`, `sam`), relation
 heads (`geometric`, and `egtr` in `closed_set`).
 """

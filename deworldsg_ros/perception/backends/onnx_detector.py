@@ -11,7 +11,7 @@ from scipy.sparse import csr_matrix
 from deworldsg_ros.checkpoints.cards import ONNX_CARD, OnnxCard, read_onnx_card
 from deworldsg_ros.checkpoints.catalogue import ONNX_FILE
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.perception.backends.nanodet import open_session
+from deworldsg_ros.perception.backends.embedded import open_session
 from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8, corners_of, softmax
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput

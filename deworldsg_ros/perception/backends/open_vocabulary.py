@@ -22,8 +22,8 @@ from deworldsg_ros.checkpoints.loading import (
     require_finite,
 )
 from deworldsg_ros.config import MAX_WORDS, PerceptionConfig
+from deworldsg_ros.perception.backends.embedded import SoftmaxCalibration, combine
 from deworldsg_ros.perception.backends.image_tensors import Preprocessing, resize
-from deworldsg_ros.perception.backends.nanodet import SoftmaxCalibration, combine
 from deworldsg_ros.perception.backends.sam import as_patch
 from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.scene.arrays import Float64, Int64, UInt8, corners_of

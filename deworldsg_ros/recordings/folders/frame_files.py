@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from abc import abstractmethod
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar
 
@@ -25,9 +26,12 @@ from deworldsg_ros.scene.camera import (
     quaternion_from_rotation,
 )
 from deworldsg_ros.scene.errors import RecordingError, RefusedInput
+from deworldsg_ros.streams.poses import unlikely_motion
 
 # Stamp of frame 0: many programs read a ROS time of zero as "unset".
 FIRST_STAMP_NS = 10**9
+# Single pictures have more steps than this that are too wide for video.
+WIDE_FRACTION = 0.2
 COLOR_NAME = re.compile(r"frame-(\d+)\.color\.(?:jpg|jpeg|png)\Z")
 
 
@@ -87,6 +91,30 @@ class FrameFiles(Dataset):
             RecordingError: for a file that cannot be read.
         """
 
+    def are_sparse(self) -> bool:
+        """Whether the frames are pictures rather than video: they have no stamps, and at the
+        assumed rate more than `WIDE_FRACTION` of the steps are faster than a camera moves.
+        """
+        if self.options.rate_hz or not self.options.poses_needed:
+            return False
+        before, wide = None, 0
+        for stamp_ns, number in self.frame_numbers.items():
+            with suppress(RefusedInput):
+                now = stamp_ns, read_pose(self._beside(number, self.pose_suffix))
+                wide += before is not None and unlikely_motion(before, now) != ""
+                before = now
+        if wide <= WIDE_FRACTION * self.frame_count:
+            return False
+        self.losses.append(
+            f"{wide} of {self.frame_count} steps are too wide for video of the assumed rate: the "
+            "frames count as single pictures; --rate says when they were taken, where things move"
+        )
+        return True
+
+    def _beside(self, number: int, suffix: str) -> Path:
+        color_path = self._colors[number]
+        return color_path.with_name(color_path.name.split(".")[0] + suffix)
+
     def _camera_pose(self, T_world_file: Float64) -> Float64:
         """Pose (4, 4) of the colour camera of the messages, from the pose of the file."""
         return T_world_file
@@ -103,9 +131,8 @@ class FrameFiles(Dataset):
     def _messages(self, *, stored: bool) -> Iterator[RoleMessage]:
         for stamp_ns, number in self.frame_numbers.items():
             color_path = self._colors[number]
-            stem = color_path.name.split(".")[0]
-            depth_path = color_path.with_name(stem + self.depth_suffix)
-            pose_path = color_path.with_name(stem + self.pose_suffix)
+            depth_path = self._beside(number, self.depth_suffix)
+            pose_path = self._beside(number, self.pose_suffix)
             needed = (depth_path, pose_path) if self.options.poses_needed else (depth_path,)
             missing = next((file for file in needed if not file.exists()), None)
             if missing is not None:

@@ -36,6 +36,19 @@ def test_registered_frames_with_their_times_and_poses(tmp_path, options, step_ns
         assert np.abs(frame.rgb.astype(int) - rgb_pixels(index)).mean() < 4  # JPEG
 
 
+def test_pictures_without_stamps_may_be_far_apart(tmp_path):
+    folder = write_seven_scenes(tmp_path / "kitchen", 5)
+    for index in range(5):
+        T = pose(index)
+        T[:3, 3] = [20.0 * index, 0.0, 0.0]
+        np.savetxt(folder / f"frame-{4 * index:06d}.pose.txt", T, "%.9g")
+    frames, recording = frames_of(folder)
+    assert len(frames) == 5 and "4 of 5 steps are too wide" in recording.losses[0]
+    # With a rate, it is a camera that jumps.
+    frames, recording = frames_of(folder, rate_hz=10.0)
+    assert len(frames) == 1 and recording.drops["pose_jump"] == 4
+
+
 # The original layout: a wall at a known distance, seen by the Kinect's two cameras.
 
 SIZE = (640, 480)

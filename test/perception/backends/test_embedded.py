@@ -8,12 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deworldsg_ros.perception.backends import nanodet
-from deworldsg_ros.perception.backends.nanodet import (
+from deworldsg_ros.perception.backends import embedded
+from deworldsg_ros.perception.backends.embedded import (
     NanoDetDetector,
+    PairDetector,
     SoftmaxCalibration,
+    SsdLite,
     combine,
     decode,
+    join_opinions,
 )
 from deworldsg_ros.scene.arrays import pairwise_iou
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -64,13 +67,13 @@ def test_iou_and_suppression_equal_the_plain_loops(rows):
     for a, row in zip(boxes, pairwise_iou(boxes, boxes)):
         assert np.allclose(row, [plain_iou(a, b) for b in boxes])
     limits = {"same_class_iou": 0.4, "any_class_iou": 0.7}
-    found = nanodet.cluster_boxes(boxes, scores, classes, **limits)
+    found = embedded.cluster_boxes(boxes, scores, classes, **limits)
     assert found.tolist() == plain_suppression(boxes, scores, classes, 0.4, 0.7)
 
 
 # Scores and logits of the codes grow evenly: from 0 to 1, and from -64 to 63.5.
 CODES = np.arange(256)
-TABLES = nanodet.Tables(
+TABLES = embedded.Tables(
     input_codes=np.tile(CODES.astype(np.uint8)[:, None], 3),
     logits=np.tile((CODES.astype(np.float32) - 128) / 2, (3, 1)),
     scores=np.tile(CODES.astype(np.float32) / 255, (3, 1)),
@@ -80,22 +83,22 @@ TABLES = nanodet.Tables(
 def empty_heads():
     """Codes of every cell: scores of 0.012, logits of 0."""
     heads = []
-    for stride in nanodet.STRIDES:
-        side = nanodet.INPUT_SIZE // stride
-        head = np.full((side, side, len(COCO_CLASSES) + 4 * nanodet.BINS), 128, np.uint8)
+    for stride in embedded.STRIDES:
+        side = embedded.INPUT_SIZE // stride
+        head = np.full((side, side, len(COCO_CLASSES) + 4 * embedded.BINS), 128, np.uint8)
         head[..., : len(COCO_CLASSES)] = 3
         heads.append(head)
     return heads
 
 
-@pytest.mark.parametrize("level", range(len(nanodet.STRIDES)))
+@pytest.mark.parametrize("level", range(len(embedded.STRIDES)))
 def test_decode_one_cell(level):
-    stride, row, column = nanodet.STRIDES[level], 5, 7
+    stride, row, column = embedded.STRIDES[level], 5, 7
     heads = empty_heads()
     cell = heads[level][row, column]
     cell[CUP] = 230
     # Distances 1, 2, 3 and 4.5 strides: one sharp bin, or two equal ones beside each other.
-    sides = cell[len(COCO_CLASSES) :].reshape(4, nanodet.BINS)
+    sides = cell[len(COCO_CLASSES) :].reshape(4, embedded.BINS)
     for side, bins in enumerate([[1], [2], [3], [4, 5]]):
         sides[side, bins] = 228
     boxes, scores = decode(heads, TABLES)
@@ -159,7 +162,7 @@ def test_calibrated_distributions_can_merge():
 def test_letterbox_keeps_the_aspect(shape):
     rgb = np.full((*shape, 3), (255, 128, 1), np.uint8)
     codes = 255 - TABLES.input_codes
-    pixels, scale = nanodet.letterbox(rgb, codes)
+    pixels, scale = embedded.letterbox(rgb, codes)
     assert pixels.shape == (1, 416, 416, 4) and pixels.dtype == np.uint8
     inside = (pixels[0, ..., :3] == (0, 127, 254)).all(axis=2)
     assert inside[0, 0]
@@ -180,8 +183,25 @@ def clock_picture():
     return image
 
 
-def test_the_shipped_weights_detect_a_clock():
-    detector = NanoDetDetector(threads=1)
+def test_a_second_opinion_counts_where_the_boxes_agree():
+    boxes = np.array([[10, 10, 60, 60], [100, 10, 160, 60]], dtype=float)
+    alone = scores_of([{CUP: 0.5}, {CUP: 0.5}])
+    beside = boxes + [2, 0, 2, 0]
+    joined, scores = join_opinions((boxes, alone), (beside[:1], scores_of([{CUP: 0.6}])))
+    assert np.array_equal(joined, boxes)
+    assert scores[0, CUP] > 0.7 > 0.5 > scores[1, CUP]
+    # Another name of the second is one more doubt, and its own boxes are no objects.
+    _, other = join_opinions((boxes, alone), (beside, scores_of([{VASE: 0.9}, {VASE: 0.9}])))
+    assert other[0, VASE] > other[0, BOTTLE] and other[0, CUP] < scores[0, CUP]
+    nothing = (np.zeros((0, 4)), np.zeros((0, 80)))
+    _, unseen = join_opinions((boxes, alone), nothing)
+    assert np.array_equal(unseen[0], unseen[1]) and unseen[0, CUP] < other[0, CUP] + 1e-12
+    assert join_opinions(nothing, (boxes, alone))[1].shape == (0, 80)
+
+
+@pytest.mark.parametrize("make", [NanoDetDetector, PairDetector])
+def test_the_shipped_weights_detect_a_clock(make):
+    detector = make(threads=1)
     found, again = (detector.detect(clock_picture(), 0.2) for _ in range(2))
     assert np.array_equal(again.class_probabilities, found.class_probabilities)
     assert np.array_equal(again.boxes_xyxy, found.boxes_xyxy)
@@ -191,5 +211,15 @@ def test_the_shipped_weights_detect_a_clock():
     assert plain_iou(found.boxes_xyxy[row], [308, 108, 492, 292]) > 0.8
     assert found.class_probabilities[row].max() > 0.7
     assert len(detector.detect(np.full((480, 640, 3), 90, np.uint8), 0.4)) == 0
-    with pytest.raises(ConfigurationError, match=r"nowhere\.onnx"):
-        NanoDetDetector(weights=Path("nowhere.onnx"))
+    beside = make(threads=2).detect(clock_picture(), 0.2)
+    again = detector.detect(clock_picture(), 0.2)
+    assert np.array_equal(beside.class_probabilities, again.class_probabilities)
+    for network in (NanoDetDetector, SsdLite):
+        with pytest.raises(ConfigurationError, match=r"nowhere\.onnx"):
+            network(weights=Path("nowhere.onnx"))
+
+
+def test_the_second_network_gives_boxes_in_pixels():
+    boxes, scores = SsdLite().candidates(clock_picture())
+    best = scores[:, COCO_CLASSES.index("clock")].argmax()
+    assert plain_iou(boxes[best], [308, 108, 492, 292]) > 0.7
