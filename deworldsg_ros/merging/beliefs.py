@@ -348,12 +348,34 @@ def probabilities(
     return result
 
 
-def merge(record: Any, other: Any) -> None:
-    """Add to a record what was observed of a second node that is the same object."""
-    # Both may have been looked at, or missed, from the same positions: the sums are not added.
-    for name in ("best_score", "looks", "reach_m"):
-        record[name] = max(record[name], other[name])
-    record["missed"] = min(record["missed"], other["missed"])
+def merge(record: Any, other: Any, mean_world: Float64) -> None:
+    """Add to a record what was observed of a second node that is the same object, at (3,) metres.
+
+    From a viewpoint that both know, either node may have had the detections of a frame.
+    """
+    more, fewer = (other, record) if other["views"] > record["views"] else (record, other)
+    fewer = fewer.copy()
+    merged = {name: max(record[name], other[name]) for name in ("best_score", "looks", "reach_m")}
+    # Both may have been missed from the same positions: the sums are not added.
+    merged["missed"] = min(record["missed"], other["missed"])
+    for name, *_ in EXISTENCE_FIELDS:
+        record[name] = merged.get(name, more[name])
+    for place in range(min(fewer["views"], VIEWS)):
+        camera = fewer["view_camera"][place].astype(np.float64)
+        known = record["view_camera"][: record["views"]].astype(np.float64)
+        to = viewpoint(known, mean_world, camera)
+        if to < 0 and record["views"] >= VIEWS:
+            continue
+        if to < 0:
+            to = record["views"]
+            record["views"] += 1
+            record["view_camera"][to] = camera
+            for name in ("view_shown", "view_detected", "view_visibility", "view_named"):
+                record[name][to] = 0
+        for name in ("view_shown", "view_visibility", "view_named"):
+            record[name][to] = max(record[name][to], fewer[name][place])
+        detected = record["view_detected"][to] + fewer["view_detected"][place]
+        record["view_detected"][to] = min(detected, record["view_shown"][to])
 
 
 def assume(record: Any, observations: int) -> None:

@@ -239,10 +239,14 @@ def _cut_pixels(
 
 
 def _with_objects(local: LocalGraph, objects: list[_Object], grid: DepthGrid | None) -> LocalGraph:
-    """The frame with other objects; merging needs no boxes, relations and colours."""
+    """The frame with other objects; merging needs no relations and colours.
+
+    Their boxes are empty: none lies within another one.
+    """
     return derived(
         local,
         instance_ids=np.array([item.value for item in objects]),
+        boxes_xyxy=np.zeros((len(objects), 4)),
         class_probabilities=np.array([item.class_probabilities for item in objects]),
         scores=np.array([item.score for item in objects]),
         means_world=np.array([item.mean for item in objects]),

@@ -302,7 +302,7 @@ class NodeRecords:
     def merge(self, graph: GlobalGraph, kept: int, removed: int) -> None:
         """Combine the records of the nodes of two slots that the graph has merged."""
         record = self.rows[kept]
-        beliefs.merge(record, self.rows[removed])
+        beliefs.merge(record, self.rows[removed], graph.nodes.means[kept])
         classes = graph.nodes.class_probabilities[kept]
         beliefs.start(record, classes.copy())
         self.joint.merge(kept, removed)

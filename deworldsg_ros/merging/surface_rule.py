@@ -67,8 +67,9 @@ class SurfaceMerging:
         NodeStates(graph, 1, graph.even_gaussians, boxes).refresh()
         spare.hidden(graph)
         spare._records.frames_before(np.zeros(3), np.zeros(3))
-        spare._records.remove(graph.nodes.slot(1))
+        parts = graph.nodes.slot(1), graph.nodes.slot(2)
         graph.merge_nodes(1, 2)
+        spare._records.merge(graph, *parts)
         # Points are dropped only from nodes whose parts belong to others.
         slots = graph.nodes.slots
         cells = spare._records.map.cells_of([graph.nodes.surface(slot) for slot in slots])
@@ -230,7 +231,8 @@ class SurfaceMerging:
         """Merge nodes that are parts of one object; returns the node ids of the rows."""
         records = self._records
         slots = graph.nodes.slots_of(node_ids).tolist()
-        records.joint.add_frame(slots, matches, local.scores, local.T_world_camera[:3, 3])
+        camera_world = local.T_world_camera[:3, 3]
+        records.joint.add_frame(slots, matches, local.scores, local.boxes_xyxy, camera_world)
         merged = False
         while (pair := records.joint.next_merge()) is not None:
             a_id, b_id = map(records.node, pair)

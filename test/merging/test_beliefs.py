@@ -15,7 +15,7 @@ from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.merging import SurfaceMerging, beliefs
-from deworldsg_ros.merging.records import NodeRecords
+from deworldsg_ros.merging.records import RECORD, NodeRecords
 from deworldsg_ros.merging.views import FULL, HALF, QUARTER
 
 # --- existence, over a walk ----------------------------------------------------------------------
@@ -383,3 +383,18 @@ def test_the_same_pictures_give_the_same_nodes_at_any_stamps(factor: float) -> N
     assert without[0] == without[1] and told[0].edges == told[1].edges
     hidden = [[(node.id, node.reason) for node in graph.hidden] for graph in told]
     assert hidden[0] == hidden[1]
+
+
+@pytest.mark.parametrize("kept", [0, 1])
+def test_a_merged_node_has_the_viewpoints_of_both_parts(kept: int) -> None:
+    rows = np.zeros(2, RECORD)
+    rows["views"] = 1, 2
+    rows["view_camera"][0, 0] = rows["view_camera"][1, 0] = 0.0, 0.0, -1.0
+    rows["view_camera"][1, 1] = 1.0, 0.0, 0.0
+    rows["view_shown"][:, :2] = (4, 0), (5, 2)
+    rows["view_detected"][:, :2] = (1, 0), (3, 2)
+    beliefs.merge(rows[kept], rows[1 - kept], np.zeros(3))
+    # From the first viewpoint, each part had some of the detections.
+    assert rows["views"][kept] == 2
+    assert rows["view_shown"][kept, :2].tolist() == [5, 2]
+    assert rows["view_detected"][kept, :2].tolist() == [4, 2]

@@ -89,25 +89,30 @@ def add_frame(
     match_scores: ArrayLike,
     touching: ArrayLike | None = None,
     camera_m: float = 0.0,
+    on_nodes: float = 0.0,
+    boxes: ArrayLike | None = None,
+    score: float = 0.9,
 ) -> None:
     """One frame of objects; unless told, each touches the slots with which it has a score."""
     shape = len(seen), len(known)
     scores = np.array(match_scores, float).reshape(shape)
     touching = scores > 0 if touching is None else np.array(touching, bool).reshape(shape)
     matched = [known.index(slot) if slot in known else -1 for slot in seen]
-    matches = matching.Matches(np.array(known), np.zeros(shape), scores, touching, matched)
-    evidence.add_frame(seen, matches, np.full(len(seen), 0.9), np.array([camera_m, 0, 0]))
+    on = np.full(shape, on_nodes)
+    matches = matching.Matches(np.array(known), on, scores, touching, matched)
+    boxes = np.zeros((len(seen), 4)) if boxes is None else np.array(boxes, float)
+    camera_world = np.array([camera_m, 0, 0])
+    evidence.add_frame(seen, matches, np.full(len(seen), score), boxes, camera_world)
 
 
 BOTH = ([4], [4, 7], [[1, 1]])
+APART = ([4, 7], [4, 7], [[1, 0], [0, 1]])
 
 
 @pytest.mark.parametrize(
     ("frames", "needed"),
     [
         pytest.param([BOTH] * 3, 3, id="overlaps"),
-        # Two objects of one frame, which need not touch, outweigh ten overlaps.
-        pytest.param([([4, 7], [4, 7], [[1, 0], [0, 1]])] + [BOTH] * 13, 14, id="shown apart"),
         pytest.param([([4], [4, 7], [[1, 0]], [[1, 1]])] * 9, 9, id="touching"),
     ],
 )
@@ -118,6 +123,36 @@ def test_evidence_for_one_object(frames: list[tuple], needed: int) -> None:
         assert evidence.next_merge() == ((4, 7) if number == needed else None)
     evidence.forget(7)
     assert evidence.next_merge() is None and evidence.balances == {}
+
+
+def test_a_viewpoint_says_once_that_two_objects_are_two_and_once_that_they_are_one() -> None:
+    evidence = matching.JointEvidence()
+    for frame in [APART] * 3 + [BOTH] * 20:
+        add_frame(evidence, *frame)
+    assert evidence.balances == {(4, 7): matching.MERGE_THRESHOLD - matching.SEPARATE_WEIGHT}
+    # One viewpoint that shows both outweighs three that show one object.
+    for number in range(1, 5):
+        assert evidence.next_merge() is None
+        add_frame(evidence, *BOTH, camera_m=number * 1.5 * matching.WIDE_STEP_M)
+    assert evidence.next_merge() == (4, 7)
+
+
+@pytest.mark.parametrize(
+    ("inner", "on_nodes", "score", "balance"),
+    [
+        pytest.param([2, 2, 9, 9], 0.8, 0.7, 0, id="a second box on an object"),
+        pytest.param([2, 2, 25, 9], 0.8, 0.7, -30, id="boxes side by side"),
+        pytest.param([2, 2, 9, 9], 0.5, 0.7, -30, id="surfaces side by side"),
+        pytest.param([2, 2, 9, 9], 0.8, 0.8, -30, id="two certain objects"),
+    ],
+)
+def test_a_sure_box_within_another_one(
+    inner: list[int], on_nodes: float, score: float, balance: int
+) -> None:
+    evidence = matching.JointEvidence()
+    touching, boxes = np.ones((2, 2), bool), [[0, 0, 10, 10], inner]
+    add_frame(evidence, *APART, touching, on_nodes=on_nodes, boxes=boxes, score=score)
+    assert evidence.balances == {(4, 7): balance}
 
 
 def test_after_a_wide_step_one_frame_that_overlaps_both_is_enough() -> None:
