@@ -163,6 +163,7 @@ def test_adjacency_equals_the_plain_loop():
             if v < 9 and u < 13 and labels[y, x] != labels[v, u]:
                 pair = tuple(sorted((int(labels[y, x]), int(labels[v, u]))))
                 borders.setdefault(pair, []).append(float(weights[direction, y, x]))
-    pairs, strength = adjacency(labels, 7, weights)
+    pairs, strength, length = adjacency(labels, 7, weights)
     assert [tuple(pair) for pair in pairs.tolist()] == sorted(borders)
     assert strength.tolist() == [sum(borders[p]) / len(borders[p]) for p in sorted(borders)]
+    assert length.tolist() == [len(borders[p]) for p in sorted(borders)]
