@@ -345,8 +345,8 @@ def _spread(
             elif distance[a] + strength[i] < distance[b] - 1e-9:
                 distance[b] = distance[a] + strength[i]
                 changed = True
-    for q in np.flatnonzero(beside):
-        for m in range(len(members)):
+    for q in range(len(beside)):
+        for m in range(len(members) if beside[q] else 0):
             square = 0.0
             for k in range(3):
                 square += ((lab[members[m], k] - lab[q, k]) / EVIDENCE_COLOUR) ** 2
