@@ -185,7 +185,7 @@ class NodeRecords:
 
     def frames_before(self, mean_world: Float64, camera_world: Float64) -> int:
         """Number of frames just before that had a place (3,) in view from the same viewpoint."""
-        count, camera_world = 0, camera_world.copy()
+        count, camera_world = 0, np.ascontiguousarray(camera_world)
         for T, (fx, fy, cx, cy, width, height) in self.recent:
             x, y, z = T[:3, :3] @ mean_world + T[:3, 3]
             other = -T[:3, :3].T @ T[:3, 3]
