@@ -367,14 +367,14 @@ def _weigh(
     """Write the columns of the evidence that depend on the beliefs. `surfaces`: from `area` on."""
     area, lab, valid, point, _, _, pairs, strength, length = surfaces
     # The beliefs of the neighbours, and the lengths of their borders.
-    of_region = np.zeros(len(area), np.float64)
+    of_region, is_member = np.zeros(len(area), np.float64), np.zeros(len(area), np.bool_)
     for m in range(len(members)):
-        of_region[members[m]] = belief[m]
+        of_region[members[m]], is_member[members[m]] = belief[m], True
     for_it = np.full(len(area), 0.5 * UNKNOWN_BORDER)
     total = np.full(len(area), UNKNOWN_BORDER)
     for i in range(len(pairs)):
         a, b = pairs[i, 0], pairs[i, 1]
-        if owner[a] < 0 and owner[b] < 0:
+        if owner[a] < 0 and owner[b] < 0 and (is_member[a] or is_member[b]):
             weight = length[i] * np.exp(-strength[i])
             for_it[a] += weight * of_region[b]
             for_it[b] += weight * of_region[a]
