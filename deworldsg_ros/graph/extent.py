@@ -215,6 +215,12 @@ def _frame_of(up: tuple[float, ...]) -> tuple[Float64, Float64]:
     return axes, np.ascontiguousarray(quaternion_from_rotation(axes.T))
 
 
+@lru_cache(maxsize=1024)
+def _axes_of(orientation_xyzw: tuple[float, ...]) -> Float64:
+    """The axes (3, 3) of a box, one a row: most boxes are asked for again as they are."""
+    return pose_from_quaternion(np.zeros(3), np.array(orientation_xyzw))[:3, :3].T
+
+
 def rounded(values: Float64, decimals: int) -> list[float]:
     """Flat list of rounded values, without negative zeros."""
     flat: list[float] = (np.round(values, decimals) + 0.0).ravel().tolist()
@@ -270,7 +276,7 @@ class _Ends:
     @classmethod
     def of(cls, box: wire.GravityBox) -> _Ends:
         """Those of a new box."""
-        axes = pose_from_quaternion(np.zeros(3), np.array(box.orientation_xyzw))[:3, :3].T
+        axes = _axes_of(tuple(box.orientation_xyzw))
         half = np.array(box.size_m) / 2.0
         return cls(np.array(box.center_m), half, axes, np.zeros((3, 2, 2), np.int64))
 
@@ -322,7 +328,7 @@ class NodeBoxes:
         self._measure(node_ids, up_world)
         rows = [row for row, node_id in enumerate(node_ids) if node_id in self._ends]
         grid = local.depth_grid
-        if grid is None or grid.instances is None or not rows:
+        if grid is None or grid.instances is None or not grid.depth_mm.size or not rows:
             return
         known = [self._ends[node_ids[row]] for row in rows]
         surfaces = [local.surface_points_world[row] for row in rows]
