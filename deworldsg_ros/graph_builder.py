@@ -131,6 +131,8 @@ class GraphBuilder:
             local = self._drift.align(local)
         logits = local.relations.logits
         weights = softmax_weights(logits) if logits.size else None
+        if self._drift is not None:
+            self.graph.up_world = self.up.estimate()
         node_ids = self.merging.merge(self.graph, self._edges.weigh(local, weights))
         self.graph.add_colours(local, node_ids)
         self._add_embeddings(local, node_ids)

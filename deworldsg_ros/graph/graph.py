@@ -101,6 +101,7 @@ class GlobalGraph:
         self._translated: tuple[Vocabulary, Vocabulary, Int64 | None]
         self._translated = (vocabulary, vocabulary, None)
         self.embeddings = NodeEmbeddings()
+        self.up_world = np.array([0.0, 0.0, 1.0])
         self._ids = NodeIds(self.nodes, remembered_frames)
         self._watchers: list[dict[int, int]] = []
         self.pairs = PairStore(self.nodes, len(vocabulary.predicates))

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from deworldsg_ros.base.kernels import kernel
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64, areas, shared_areas
 from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.vocabulary import ALONE_IN_PLACE
 
 # --- The one-to-one assignment with the greatest total score.
 #
@@ -274,6 +276,60 @@ CERTAIN_SCORE = 0.75
 # picture: together they say at most one merge, or once that there are two objects.
 WIDE_STEP_M = 0.2
 WIDE_STEP_FACTOR = 3
+
+
+# --- Nodes of one class that stand in one place.
+#
+# A detector that sees the back of a chair, and later its seat, gives two nodes whose surfaces do
+# not meet. No two chairs stand one over the other: nodes of such a class whose footprints overlap
+# are one object.
+
+# Of the area of the smaller footprint.
+FOOTPRINT_OVERLAP = 0.3
+# The larger footprint does not grow by more: the mask of a row of chairs takes in none beside it.
+GROWTH_M = 0.2
+# The footprint is between these quantiles of the surface.
+FOOTPRINT_QUANTILES = (0.04, 0.96)
+# Footprints farther apart than this many standard deviations of both do not overlap.
+FAR = 2.5
+
+
+def in_one_place(graph: GlobalGraph, found: Sequence[int], others: Int64) -> list[Pair]:
+    """Pairs of nodes that stand in one place.
+
+    Args:
+        graph: the nodes and up.
+        found: slots of the nodes that the frame has detected: one of each pair is of these. Both are
+            no pair, as the frame would make two nodes of them again.
+        others: slots of the nodes in view.
+    """
+    nodes = graph.nodes
+    slots = np.union1d(np.asarray(found, np.int64), others)
+    slots = slots[nodes.ids[slots] >= 0]
+    labels = nodes.class_probabilities[slots].argmax(axis=1)
+    alone = np.array([name in ALONE_IN_PLACE for name in graph.vocabulary.classes])[labels]
+    slots, labels = slots[alone], labels[alone]
+    plane = np.linalg.svd(graph.up_world[None])[2][1:]
+    means = nodes.means[slots] @ plane.T
+    spread_m = np.sqrt(np.trace(nodes.covariances[slots], axis1=1, axis2=2))
+    distance_m = np.linalg.norm(means[:, None] - means[None], axis=2)
+    near = (distance_m < FAR * (spread_m[:, None] + spread_m[None])) & (labels[:, None] == labels)
+    is_found = np.isin(slots, found)
+    pairs = np.argwhere(np.triu(near & (is_found[:, None] ^ is_found[None]), 1)).tolist()
+    bounds = {
+        row: np.quantile(nodes.surface(slots[row]) @ plane.T, FOOTPRINT_QUANTILES, axis=0)
+        for row in {row for pair in pairs for row in pair}
+    }
+    return [(int(slots[a]), int(slots[b])) for a, b in pairs if _is_one_place(bounds[a], bounds[b])]
+
+
+def _is_one_place(a: Float64, b: Float64) -> bool:
+    """Whether two footprints, lower and upper corners (2, 2), are of one object."""
+    larger = np.maximum(a[1] - a[0], b[1] - b[0])
+    hull = np.maximum(a[1], b[1]) - np.minimum(a[0], b[0])
+    shared = np.maximum(np.minimum(a[1], b[1]) - np.maximum(a[0], b[0]), 0.0).prod()
+    smaller = min((a[1] - a[0]).prod(), (b[1] - b[0]).prod())
+    return bool((hull <= larger + GROWTH_M).all() and shared > FOOTPRINT_OVERLAP * smaller)
 
 
 class JointEvidence:

@@ -25,7 +25,7 @@ from deworldsg_ros.merging.editing import (
     reject_deleted,
 )
 from deworldsg_ros.merging.life_cycle import LifeCycle
-from deworldsg_ros.merging.matching import Matches, match
+from deworldsg_ros.merging.matching import Matches, in_one_place, match
 from deworldsg_ros.merging.records import NodeRecords, apply_correction
 from deworldsg_ros.merging.views import FrameArrays, View, frame_arrays, see, see_nothing, with_seen
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
@@ -105,7 +105,7 @@ class SurfaceMerging:
         matches = self._associate(graph, local, cells, view)
         node_ids = self._update(graph, local, cells, matches)
         self._judge_cells(graph, local, cells, node_ids, frame)
-        node_ids = self._merge_parts(graph, local, matches, node_ids)
+        node_ids = self._merge_parts(graph, local, matches, node_ids, view.slots)
         self._life_cycle.observe(graph, local, view, node_ids)
         return node_ids
 
@@ -226,7 +226,12 @@ class SurfaceMerging:
             graph.drop_points(node_ids, self._records.map.points_in(rejected, graph.nodes, slots))
 
     def _merge_parts(
-        self, graph: GlobalGraph, local: LocalGraph, matches: Matches, node_ids: list[int]
+        self,
+        graph: GlobalGraph,
+        local: LocalGraph,
+        matches: Matches,
+        node_ids: list[int],
+        view_slots: Int64,
     ) -> list[int]:
         """Merge nodes that are parts of one object; returns the node ids of the rows."""
         records = self._records
@@ -235,14 +240,22 @@ class SurfaceMerging:
         records.joint.add_frame(slots, matches, local.scores, local.boxes_xyxy, camera_world)
         merged = False
         while (pair := records.joint.next_merge()) is not None:
-            a_id, b_id = map(records.node, pair)
-            if graph.edits and not may_merge(graph, a_id, b_id):
-                continue
-            kept, removed = pair if a_id < b_id else pair[::-1]
-            graph.merge_nodes(a_id, b_id)
-            records.merge(graph, kept, removed)
-            merged = True
+            merged |= self._merge_pair(graph, *pair)
+        for pair in in_one_place(graph, slots, view_slots):
+            if records.node(pair[0]) and records.node(pair[1]):
+                merged |= self._merge_pair(graph, *pair)
         return [graph.resolve(node_id) for node_id in node_ids] if merged else node_ids
+
+    def _merge_pair(self, graph: GlobalGraph, a: int, b: int) -> bool:
+        """Merge the nodes of two slots; the older id stays. False = an edit forbids it."""
+        records = self._records
+        a_id, b_id = records.node(a), records.node(b)
+        if graph.edits and not may_merge(graph, a_id, b_id):
+            return False
+        kept, removed = (a, b) if a_id < b_id else (b, a)
+        graph.merge_nodes(a_id, b_id)
+        records.merge(graph, kept, removed)
+        return True
 
 
 def _spare_frame(stamp_ns: int) -> LocalGraph:

@@ -21,6 +21,7 @@ from support.surfaces import (
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.merging import SurfaceMerging
+from deworldsg_ros.merging.matching import in_one_place
 from deworldsg_ros.merging.surface_map import CELL_M
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 
@@ -125,6 +126,29 @@ def test_two_halves_of_an_object_are_merged(scene) -> None:
     assert list(scene.graph.nodes.slot_of) == [1]
     assert scene.graph.take_removals() == {2: 1}
     assert scene.see((halves[1], TABLE)) == [1]
+
+
+# The back of a chair above its seat, with air between, and the same beside it.
+SEAT = slab((0, 0, 0.45), (0.5, 0.5, 0.04))
+
+
+@pytest.mark.parametrize(
+    ("label", "x_m", "up", "count"),
+    [
+        (CHAIR, 0.2, (0.0, 0.0, 1.0), 1),
+        (CHAIR, 0.7, (0.0, 0.0, 1.0), 2),  # another chair
+        (CHAIR, 0.2, (1.0, 0.0, 0.0), 2),  # up is elsewhere: one stands beside the other
+        (CUP, 0.2, (0.0, 0.0, 1.0), 2),  # cups are stacked
+    ],
+)
+def test_parts_of_a_chair_over_each_other_are_one(scene, label, x_m, up, count) -> None:
+    scene.graph.up_world = np.array(up)
+    back = slab((x_m, 0, 0.8), (0.05, 0.45, 0.3))
+    (seat,), (other,) = scene.see((SEAT, label), times=3), scene.see((back, label), times=3)
+    assert seat != other  # they do not touch
+    slots = scene.graph.nodes.slots_of([seat, other])
+    pairs = in_one_place(scene.graph, slots[1:].tolist(), slots[:1])
+    assert pairs == [tuple(slots.tolist())][: 2 - count]
 
 
 def test_a_node_of_two_objects_loses_the_surface_of_one_when_both_are_detected(scene) -> None:

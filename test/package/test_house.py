@@ -20,7 +20,7 @@ MAX_PARAMETERS = 8
 MAX_PARTS = 0.08
 MAX_KERNELS = 120
 # Of one frame.
-MAX_ENTERED, MAX_SWITCHES = 45, 450
+MAX_ENTERED, MAX_SWITCHES = 45, 490
 
 
 @pytest.fixture(scope="module")
