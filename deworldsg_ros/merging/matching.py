@@ -299,8 +299,8 @@ def in_one_place(graph: GlobalGraph, found: Sequence[int], others: Int64) -> lis
 
     Args:
         graph: the nodes and up.
-        found: slots of the nodes that the frame has detected: one of each pair is of these. Both are
-            no pair, as the frame would make two nodes of them again.
+        found: slots of the nodes that the frame has detected: one of each pair is of these. Two
+            of these are no pair: the frame would make two nodes of them again.
         others: slots of the nodes in view.
     """
     nodes = graph.nodes

@@ -225,8 +225,8 @@ REASONS: dict[str, str] = {
     "wrong_frame": "The frame_id of a pose or local graph differs from the world frame of this "
     "session. Publish all of them in one world frame, and set `inputs.world_frame` to it.",
     "pose_jump": "The camera moved more than 1 m between two frames, or rotated faster than 360 "
-    "degrees per second, and its depth does not show the same surfaces from there. Check the poses; "
-    "a new position is accepted after five consistent frames.",
+    "degrees per second, and its depth does not show the same surfaces from there. Check the "
+    "poses; a new position is accepted after five consistent frames.",
     "no_pose": "No pose is within `inputs.pose_slop_s` of the image. Check the rate and the clock "
     "of the poses.",
     "no_transform": "The odometry describes another frame than the camera's, and TF does not "
