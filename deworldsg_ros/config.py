@@ -41,14 +41,14 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     detector: Annotated[
         str,
         option(
-            "detector: pair (NanoDet and SSDLite as one, shipped weights, COCO classes), nanodet "
-            "(the first of them alone), transformers (D-FINE, RF-DETR and "
+            "detector: nanodet (shipped weights, COCO classes), pair (NanoDet and SSDLite as one, "
+            "shipped, too), transformers (D-FINE, RF-DETR and "
             "others of fixed classes; rtdetr, the paper's, is another name of it), open_vocabulary "
             "(OWLv2, Grounding DINO, OmDet-Turbo or SAM 3 look for `words`), onnx (exported by "
             "`deworldsg models export`, runs without torch), topic (another process sends them) or "
             "a plug-in"
         ),
-    ] = "pair"
+    ] = "nanodet"
     segmenter: Annotated[
         str,
         option(

@@ -115,8 +115,8 @@ def _embedder(config: PerceptionConfig) -> Embedder:
 
 
 DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
-    "pair": _pair,
     "nanodet": _nanodet,
+    "pair": _pair,
     "transformers": _transformers,
     # The same, by the name of the paper's detector.
     "rtdetr": _transformers,

@@ -55,7 +55,7 @@ def test_a_detector_is_found_by_name_and_its_options_are_checked():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("blue_things", "expected one of pair, nanodet, transformers, .*, red_things"),
+        ("blue_things", "expected one of nanodet, pair, transformers, .*, red_things"),
         ("red_things {least_px: 0}", "deworldsg-example-plugin 0.1.0.*`int` >= 1.*least_px"),
         ("red_things {least: 3}", "`least`"),
         ("red_things 20", "expected options as in"),

@@ -17,8 +17,7 @@ from deworldsg_ros.recordings.writer import write_mcap
 from deworldsg_ros.scene.errors import RecordingError, RefusedInput
 
 FRAMES = 40
-# The embedded detector's threshold.
-TOPIC = Config(perception=PerceptionConfig(detector="topic", score_threshold=0.5))
+TOPIC = Config(perception=PerceptionConfig(detector="topic"))
 
 
 @pytest.fixture(scope="module")
