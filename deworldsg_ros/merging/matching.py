@@ -305,7 +305,7 @@ def in_one_place(graph: GlobalGraph, found: Sequence[int], others: Int64) -> lis
     """
     nodes = graph.nodes
     slots = np.union1d(np.asarray(found, np.int64), others)
-    slots = slots[nodes.ids[slots] >= 0]
+    slots = slots[nodes.surface_counts[slots] > 0]
     labels = nodes.class_probabilities[slots].argmax(axis=1)
     alone = np.array([name in ALONE_IN_PLACE for name in graph.vocabulary.classes])[labels]
     slots, labels = slots[alone], labels[alone]

@@ -341,7 +341,7 @@ class NodeRecords:
         if "frames" not in memory or checked(memory, "cell_m", np.float64) != self.map.cell_m:
             _rebuild(self, graph, slots)
             return
-        if memory["scores"].ndim == 2:  # an older release has one score of a cell
+        if "scores" in memory and memory["scores"].ndim == 2:  # of an older release: one of a cell
             both = np.repeat(memory["scores"][:, None], SCORES, axis=1)
             memory = {**memory, "scores": both}
         check_memory(memory, RECORD, len(graph.vocabulary.classes))
