@@ -307,7 +307,8 @@ def in_one_place(graph: GlobalGraph, found: Sequence[int], others: Int64) -> lis
     slots = np.union1d(np.asarray(found, np.int64), others)
     slots = slots[nodes.surface_counts[slots] > 0]
     labels = nodes.class_probabilities[slots].argmax(axis=1)
-    alone = np.array([name in ALONE_IN_PLACE for name in graph.vocabulary.classes])[labels]
+    names = graph.vocabulary.classes  # thousands, with a detector of free text
+    alone = np.array([names[label] in ALONE_IN_PLACE for label in labels.tolist()], np.bool_)
     slots, labels = slots[alone], labels[alone]
     plane = np.linalg.svd(graph.up_world[None])[2][1:]
     means = nodes.means[slots] @ plane.T
