@@ -366,6 +366,7 @@ CLASS_BIAS = {
     "bottle": -0.15,
     "book": -0.27,
 }
+_NAME_BIAS = BIAS + np.array([CLASS_BIAS.get(name, 0.0) for name in COCO_CLASSES])
 PAIR_CALIBRATION = SoftmaxCalibration(temperature=0.6)
 
 
@@ -405,8 +406,7 @@ def join_opinions(
         second: those of the second.
     """
     boxes, evidence = evidence_of(first, second)
-    bias = BIAS + np.array([CLASS_BIAS.get(name, 0.0) for name in COCO_CLASSES])
-    return boxes, np.asarray(1.0 / (1.0 + np.exp(-(SCALE * evidence + bias))))
+    return boxes, np.asarray(1.0 / (1.0 + np.exp(-(SCALE * evidence + _NAME_BIAS))))
 
 
 def evidence_of(
