@@ -44,8 +44,8 @@ BEFORE_M, BEFORE_FRACTION = 0.03, 0.01
 AROUND_M = 0.02
 # Ends of two boxes are the same within `END_M` if their axes are within this.
 SAME_COS = math.cos(math.radians(15.0))
-# A side may go on if so many frames end before it does, and no more than this fraction show its
-# end: masks and depth are wrong in some.
+# A side may go on if at least MIN_CUT frames do not show its end, and at most MAX_SEEN of all do:
+# masks and depth are wrong in some.
 MIN_CUT, MAX_SEEN = 2, 0.1
 # Weights of points with these many points around.
 _EVEN_WEIGHTS = np.append(0.0, np.arange(1.0, 4097.0) ** -0.5)
@@ -253,7 +253,7 @@ def surface_points(node: wire.NodeState) -> Float64:
 ShownSurfaces = Callable[[Int64], Bool | None]
 # The two ends of an axis.
 _SIGNS = np.array([-1.0, 1.0])
-# A box is measured again after this fraction of its frames, and so many at least and at most.
+# The box of a node is measured again after this fraction of its frames more, within these limits.
 AGAIN_FRACTION, LEAST_FRAMES, MOST_FRAMES = 0.5, 4, 32
 
 

@@ -78,6 +78,7 @@ class GlobalGraph:
         pairs: what is known about pairs of nodes, by slots.
         edits: what an operator has said about nodes; read only.
         embeddings: what some of the nodes look like; read only.
+        up_world: (3,) unit vector against gravity, as far as the poses so far tell.
         even_gaussians: messages show the `even_moments` of a node's surface instead of the pooled
             Gaussian.
     """

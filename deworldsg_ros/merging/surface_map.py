@@ -389,7 +389,7 @@ def cell_bits(masks: UInt64) -> UInt64:
 
 
 def _masks(bits: Bool) -> UInt64:
-    """Masks (m,) of blocks, of which cells are in them, (m, 64)."""
+    """One mask for each of m blocks, (m,); bits (m, 64) say which cells are in it."""
     return np.packbits(bits, axis=1, bitorder="little").view("<u8")[:, 0]
 
 

@@ -432,7 +432,7 @@ class UpEstimator:
         return self._known
 
     def estimate(self) -> Float64:
-        """`up_world` of all poses so far, as if nobody had asked for it before."""
+        """Up of all poses so far, computed anew: `up_world` may keep an older answer."""
         if self._axis != "auto":
             return np.array(AXES[self._axis])
         z = np.array(AXES["z"])

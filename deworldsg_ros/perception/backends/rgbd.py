@@ -62,11 +62,11 @@ MAX_MEAN_COLOUR = 6.0
 UNKNOWN_BORDER = 0.3
 # A region touches a side of the box that is at most this fraction of the box's side away.
 TOUCHING_FRACTION = 0.04
-# The object's colours are those of so many of its largest regions, with at least this belief.
+# The colours of the object come from its COLOURS largest regions with at least this belief.
 COLOURS = 16
 COLOUR_BELIEF = 0.6
-# The object's depths are between these fractions of its cells, ordered by depth; the middle is a
-# scale for differences, of which larger ones count as MAX_DEPTH_DIFFERENCE.
+# The object's depths are between these fractions of its cells, ordered by depth. Differences
+# are divided by the middle one, and larger ones count as MAX_DEPTH_DIFFERENCE.
 DEPTH_QUANTILES = (0.1, 0.5, 0.9)
 MAX_DEPTH_DIFFERENCE = 0.5
 # Beliefs keep this far from 0 and 1 in log odds.
