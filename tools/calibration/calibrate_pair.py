@@ -3,8 +3,8 @@
     python tools/calibration/calibrate_pair.py RECORDING=TRUTH.json ...
 
 RECORDING is a folder of frames; TRUTH has boxes of its objects in the world: `names` (all that are
-right) with `centroid_m` and `extent_m`, or `label` with `aabb`. Rooms of one data set, whose folders
-lie side by side, are one scene: they are left out together.
+right) with `centroid_m` and `extent_m`, or `label` with `aabb`. Rooms of one data set, in folders
+side by side, are one scene: they are left out together.
 
 A sample is one of the two best names of a box, in a frame after the camera has moved by 20 cm or
 10°. The name is right if the surface in the middle of the box lies within 30 cm (rendered rooms:
