@@ -27,6 +27,9 @@ EVEN_RADIUS_M = 0.015
 # median of that distance. Mixed pixels at depth edges lie apart from the surface. Chosen on the two
 # rendered rooms: 1.5 cuts corners off, 3 keeps mixed pixels.
 OUTLIER_FACTOR = 2.0
+# Nor if that neighbour is this near, where the images tell which points are the node's: a seat
+# behind a table is in few views, its points are far apart, and no outliers.
+NEAR_ENOUGH_M = 0.06
 # So few points have no outliers.
 FEW_POINTS = 6
 # A part of a surface so far from the rest, horizontally, and with so much fewer points than the
@@ -45,7 +48,8 @@ AROUND_M = 0.02
 # Ends of two boxes are the same within `END_M` if their axes are within this.
 SAME_COS = math.cos(math.radians(15.0))
 # A side may go on if at least MIN_CUT frames do not show its end, and at most MAX_SEEN of all do:
-# masks and depth are wrong in some.
+# masks and depth are wrong in some. Or if as many frames say that what is beyond is the object's as
+# say that it is not.
 MIN_CUT, MAX_SEEN = 2, 0.1
 # Weights of points with these many points around.
 _EVEN_WEIGHTS = np.append(0.0, np.arange(1.0, 4097.0) ** -0.5)
@@ -129,7 +133,10 @@ def _box_around(
     if is_smallest:
         columns = columns[:, :FEWER_POINTS].copy()
     upright, squared = _third_neighbours(columns, axes)
-    upright = upright[:, squared <= OUTLIER_FACTOR**2 * np.median(squared)]
+    limit = OUTLIER_FACTOR**2 * float(np.median(squared))
+    if not is_smallest:
+        limit = max(limit, NEAR_ENOUGH_M**2)
+    upright = upright[:, squared <= limit]
     if not is_smallest:
         upright = upright[:, _in_main_parts(np.ascontiguousarray(upright))]
     _box(np.ascontiguousarray(upright), axes, quat_axes, is_smallest, box)
@@ -263,7 +270,8 @@ class _Ends:
 
     Attributes:
         center: (3,), half: (3,) metres; axes: (3, 3) rows.
-        counts: (3, 2, 2), by axis and end: frames that show what is beyond, and that do not.
+        counts: (3, 2, 3), by axis and end: frames that show what is beyond, that do not, and in
+            which the object goes on.
         due: number of observations of the node from which on it is measured again.
     """
 
@@ -278,7 +286,7 @@ class _Ends:
         """Those of a new box."""
         axes = _axes_of(tuple(box.orientation_xyzw))
         half = np.array(box.size_m) / 2.0
-        return cls(np.array(box.center_m), half, axes, np.zeros((3, 2, 2), np.int64))
+        return cls(np.array(box.center_m), half, axes, np.zeros((3, 2, 3), np.int64))
 
     def shared(self, other: _Ends) -> Bool:
         """Which ends (3, 2) of another box are those of this one, too."""
@@ -310,8 +318,9 @@ class NodeBoxes:
         """The box of a node, with the sides that may go on."""
         known, sides = self._ends.get(node_id), UNSET
         if known is not None:
-            seen, cut = known.counts.transpose(2, 0, 1)
+            seen, cut, on = known.counts.transpose(2, 0, 1)
             open_ = (cut >= MIN_CUT) & (seen <= MAX_SEEN * (seen + cut))
+            open_ |= (on >= MIN_CUT) & (on >= seen)
             if open_.any():
                 open_ &= known.shared(_Ends.of(box))
             if open_.any():
@@ -349,9 +358,9 @@ class NodeBoxes:
         cells = 6 * of[places] + 2 * sides + at
         total = np.maximum(np.bincount(cells, minlength=size), 1)
         parts = [np.bincount(cells, kind, size) >= SEEN_FRACTION * total for kind in seen]
-        shown, cut = np.reshape(parts, (2, len(rows), 3, 2))
-        for ends, is_shown, is_cut in zip(known, shown, cut & ~shown):
-            ends.counts += np.stack([is_shown, is_cut], axis=2)
+        shown, cut, goes_on = np.reshape(parts, (3, len(rows), 3, 2))
+        for ends, *kinds in zip(known, shown & ~goes_on, cut & ~shown & ~goes_on, goes_on):
+            ends.counts += np.stack(kinds, axis=2)
 
     def _measure(self, node_ids: Sequence[int], up_world: Callable[[], Float64]) -> None:
         """Measure the boxes of nodes anew that have been observed often enough since."""
@@ -385,10 +394,10 @@ def _seen_beyond(
     beyond: Float64,
     bears: Bool,
     values: Int64,
-) -> tuple[Bool, Bool]:
-    """Whether a frame shows what is beyond points (n, 3), (n,) bool; and whether it hides it.
+) -> tuple[Bool, Bool, Bool]:
+    """Whether a frame shows what is beyond points (n, 3), hides it, or shows more of the object.
 
-    Neither: there is no depth, or the object goes on.
+    Each (n,) bool. None of them: there is no depth, or the object before or behind.
 
     Args:
         local: the frame, and
@@ -412,7 +421,9 @@ def _seen_beyond(
     hidden, known = depth_m < limit_m, depth_m > 0
     assert grid.instances is not None
     shown = inside & known & ~hidden & (grid.instances[at] != values)
-    return np.asarray(shown), np.asarray(~inside | (known & hidden))
+    own = inside & known & (grid.instances[at] == values)
+    own &= np.abs(depth_m - z) <= BEFORE_M + BEFORE_FRACTION * ahead
+    return np.asarray(shown), np.asarray(~inside | (known & hidden)), np.asarray(own)
 
 
 @kernel

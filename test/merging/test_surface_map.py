@@ -326,6 +326,9 @@ def test_a_side_that_no_view_shows_to_its_end_may_be_longer() -> None:
     assert box_after(*[1.2] * 8).at_least == [True, True, False]
     # Two frames that show the ends are enough.
     assert box_after(*[1.2] * 4, *[0.9] * 40).at_least == [False, True, False]
+    # Half of the masks go on beyond the box; then fewer.
+    assert box_after(*[TRUE_M, WIDE_M] * 8).at_least == [True, True, False]
+    assert box_after(*[TRUE_M, TRUE_M, WIDE_M] * 6).at_least == [False, True, False]
 
 
 def test_without_a_detection_or_an_instance_image_the_surface_stays() -> None:
