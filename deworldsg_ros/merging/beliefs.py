@@ -26,7 +26,9 @@ LABELS = 8
 DRAWN = 0.5
 WRONG = 0.2
 OUTLIERS = 0.4
-# Probability of all other labels together.
+# A detector that is wrong says the same wrong name from all sides. So no number of views makes a name
+# more certain than the view that was most certain of it; and all other labels together always keep
+# the probability OTHERS.
 OTHERS = 0.05
 
 # The part of a node's record that belongs to its name: the labels (-1 = none), the probability
@@ -36,6 +38,8 @@ NAME_FIELDS: list[Any] = [
     ("labels", np.int64, LABELS),
     ("joint", np.float64, (LABELS, LABELS)),
     ("named_from", np.int64),
+    # The probability of each label in the view that was most certain of it.
+    ("most_certain", np.float64, LABELS),
 ]
 
 
@@ -47,6 +51,8 @@ def start(record: Any, probabilities: Float64) -> None:
     np.fill_diagonal(drawn, 1.0 - WRONG)
     record["labels"], record["joint"], record["named_from"] = -1, 0.0, 0
     record["labels"][:count] = order
+    record["most_certain"] = 0.0
+    record["most_certain"][:count] = probabilities[order]
     joint = drawn * probabilities[order]
     record["joint"][:count, :count] = joint / joint.sum()
 
@@ -81,10 +87,18 @@ def observe_names(
             record.named_from = place
         else:
             record.named_from = -1
-        classes[index] = OTHERS / seen.shape[1]
+        best, certain = 0.0, 0.0
         for i in range(LABELS):
             if record.labels[i] >= 0:
-                classes[index, record.labels[i]] += (1.0 - OTHERS) * record.joint[i].sum()
+                belief = record.joint[i].sum()
+                record.most_certain[i] = max(record.most_certain[i], seen[index, record.labels[i]])
+                if belief > best:
+                    best, certain = belief, record.most_certain[i]
+        others = max(OTHERS, 1.0 - certain)
+        classes[index] = others / seen.shape[1]
+        for i in range(LABELS):
+            if record.labels[i] >= 0:
+                classes[index, record.labels[i]] += (1.0 - others) * record.joint[i].sum()
 
 
 @kernel
@@ -100,7 +114,7 @@ def _name(record: Any, seen: Float64, is_new: bool) -> None:
             if record.labels[i] < 0:
                 break
     if not is_known:
-        record.labels[place] = label
+        record.labels[place], record.most_certain[place] = label, 0.0
         record.joint[:, place] = 0.0
         # If the object is this, all names so far were wrong.
         for j in range(LABELS):

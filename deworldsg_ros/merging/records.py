@@ -90,6 +90,17 @@ def _records(memory: Arrays, record: np.dtype[np.void]) -> NDArray[np.void]:
     return records
 
 
+def _with_certainties(records: NDArray[np.void]) -> NDArray[np.void]:
+    """Records of an older release have no certainties: nothing bounds their names."""
+    names = [name for name in RECORD.names or () if name != "most_certain"]
+    if records.ndim != 1 or list(records.dtype.names or ()) != names:
+        return records
+    whole = np.ones(len(records), RECORD)
+    for name in names:
+        whole[name] = records[name]
+    return whole
+
+
 def _check_existence(records: NDArray[np.void]) -> None:
     within("records (best_score)", records["best_score"], 0.0, 1.0 + 1e-9)
     for name in ("looks", "missed", "reach_m", "before", "pending", "view_detected", "view_shown"):
@@ -115,6 +126,7 @@ def _check_names(records: NDArray[np.void], class_count: int) -> None:
     ordered = np.sort(np.where(known, labels, -1 - np.arange(LABELS)), axis=1)
     holds("records (labels)", (np.diff(ordered, axis=1) > 0).all(), "each label once")
     within("records (joint)", joint, 0.0, 1.0 + MAX_SUM_ERROR)
+    within("records (most_certain)", records["most_certain"], 0.0, 1.0 + MAX_SUM_ERROR)
     both = known[:, :, None] & known[:, None, :]
     sums = (joint * both).sum(axis=(1, 2))
     within("records (sum of joint)", sums, 1e-12, 1.0 + MAX_SUM_ERROR)
@@ -344,6 +356,7 @@ class NodeRecords:
         if "scores" in memory and memory["scores"].ndim == 2:  # of an older release: one of a cell
             both = np.repeat(memory["scores"][:, None], SCORES, axis=1)
             memory = {**memory, "scores": both}
+        memory = {**memory, "records": _with_certainties(memory["records"])}
         check_memory(memory, RECORD, len(graph.vocabulary.classes))
         records, counts = memory["records"], memory["block_counts"]
         kept = np.isin(records["node_id"], node_ids)

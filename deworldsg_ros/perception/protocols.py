@@ -29,6 +29,8 @@ class Detections:
         embeddings: (n, D) float32, what the image shows of each object, of any length; a row that
             is 0 or not finite = not of this object; None = none.
         embedding_model: name of the model that made the embeddings.
+        certainties: (n,) float64, probability that the name of an object whose best view is this
+            one is right; None = what `class_probabilities` say.
     """
 
     boxes_xyxy: Float64
@@ -39,6 +41,7 @@ class Detections:
     masks: tuple[MaskPatch, ...] | None = None
     embeddings: Float32 | None = None
     embedding_model: str = ""
+    certainties: Float64 | None = None
 
     def __post_init__(self) -> None:
         count = len(self.scores)
@@ -47,7 +50,7 @@ class Detections:
                 f"{count} scores, boxes of shape {self.boxes_xyxy.shape}, class probabilities of "
                 f"shape {self.class_probabilities.shape}; expected one row per object"
             )
-        for name in ("features", "masks", "embeddings"):
+        for name in ("features", "masks", "embeddings", "certainties"):
             values = getattr(self, name)
             if values is not None and len(values) != count:
                 raise ValueError(f"{count} scores, {len(values)} {name}; expected as many")
@@ -68,6 +71,16 @@ class Detections:
             features=None if self.features is None else self.features[rows],
             masks=None if self.masks is None else tuple([self.masks[row] for row in kept]),
             embeddings=None if self.embeddings is None else self.embeddings[rows],
+            certainties=None if self.certainties is None else self.certainties[rows],
+        )
+
+    def doubted(self) -> Float64:
+        """The class distributions (n, C) with the rest of the certainties on all classes."""
+        if self.certainties is None:
+            return self.class_probabilities
+        certain = self.certainties[:, None]
+        return (
+            certain * self.class_probabilities + (1.0 - certain) / self.class_probabilities.shape[1]
         )
 
 

@@ -525,7 +525,7 @@ class Perception:
             height=intrinsics.height,
             vocabulary=self.vocabulary,
             boxes_xyxy=objects.boxes_xyxy,
-            class_probabilities=objects.class_probabilities,
+            class_probabilities=objects.doubted() if self._refine else objects.class_probabilities,
             scores=objects.scores,
             relations=relations,
             colours_lab=mean_colours(frame.rgb, instances, [mask.window for mask in masks]),

@@ -308,6 +308,13 @@ def test_the_name_that_returns_wins(labels: list[int]) -> None:
     assert named(frames_of(labels)).argmax() == 3
 
 
+def test_views_do_not_make_a_name_surer_than_the_surest_of_them() -> None:
+    rest = (1 - 0.6) / COUNT
+    assert named(frames_of([3] * 40, 0.6), 1)[3] == pytest.approx(0.6 + rest, abs=0.01)
+    once = [*frames_of([3] * 20, 0.6), *frames_of([3], 0.9), *frames_of([3] * 20, 0.6)]
+    assert named(once, 1)[3] == pytest.approx(0.9, abs=0.01)
+
+
 def filtered(frames: list[np.ndarray], frames_per_view: int) -> np.ndarray:
     """The same filter with all labels, by matrices; for few classes."""
     count = len(frames[0])
@@ -319,7 +326,10 @@ def filtered(frames: list[np.ndarray], frames_per_view: int) -> np.ndarray:
         joint = (1 - leave) * joint + leave * drawn * joint.sum(axis=1, keepdims=True)
         joint = joint * ((1 - beliefs.OUTLIERS) * seen + beliefs.OUTLIERS / count)[None]
         joint /= joint.sum()
-    return beliefs.OTHERS / count + (1 - beliefs.OTHERS) * joint.sum(axis=1)
+    classes = joint.sum(axis=1)
+    # The best name is no more certain than in the view that was most certain of it.
+    others = max(beliefs.OTHERS, 1 - np.max(frames, axis=0)[classes.argmax()])
+    return others / count + (1 - others) * classes
 
 
 @pytest.mark.parametrize("seed", range(10))

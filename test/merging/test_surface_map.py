@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.lib.recfunctions import repack_fields
 from support.merging import VOCABULARY, node_states, random_pose
 from support.surfaces import CAMERA, CUP, TABLE, frame
 
@@ -16,6 +17,7 @@ from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
 from deworldsg_ros.merging import SurfaceMerging
 from deworldsg_ros.merging.cell_kernels import MIN_OWNER_CELLS, SHOWN, SURFACE, CellSets
+from deworldsg_ros.merging.records import RECORD
 from deworldsg_ros.merging.surface_map import (
     CELL_M,
     HIT,
@@ -361,8 +363,11 @@ def test_a_map_continues_the_evidence(tmp_path: Path) -> None:
     # An older release has one score of a cell.
     arrays = graph_files.read(path)
     arrays["merging.scores"] = np.ascontiguousarray(arrays["merging.scores"][:, SURFACE])
+    names = [name for name in RECORD.names or () if name != "most_certain"]
+    arrays["merging.records"] = repack_fields(arrays["merging.records"][names])
     graph_files.write(path, arrays)
-    assert read_map(config, path).merging.memory()["scores"].shape[1:] == (2, 64)
+    memory = read_map(config, path).merging.memory()
+    assert memory["scores"].shape[1:] == (2, 64) and (memory["records"]["most_certain"] == 1).all()
     # A map of an older release starts without evidence.
     arrays = graph_files.read(path)
     for name in ("scores", "records", "looks", "fates", "frames"):

@@ -82,11 +82,18 @@ class SoftmaxCalibration:
     at 0.5. The softmax of their logits keeps their order. The temperature is fitted by likelihood
     (temperature scaling, Guo et al. 2017) with tools/calibration/calibrate_detector.py.
 
+    The softmax compares names with each other. Whether the best one is right at all is another
+    question: in an object that has none of the names, or seen for a moment, it is not. The score in
+    the best view of an object tells; more views add nothing (docs/dev/perception.md).
+
     Attributes:
         temperature: above 0; below 1 sharpens.
+        certainty: slope and offset of the log odds that a name with a score is right, from those of
+            the score; None = not known (tools/calibration/calibrate_names.py).
     """
 
     temperature: float
+    certainty: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.temperature > 0:
@@ -95,6 +102,13 @@ class SoftmaxCalibration:
     def __call__(self, scores: Float64) -> Float64:
         """Distributions (n, C), rows sum to one, of sigmoid scores (n, C)."""
         return np.asarray(softmax(logit(scores) / self.temperature))
+
+    def certainties(self, scores: Float64) -> Float64 | None:
+        """The probability (n,) that names with these scores are right; None = not known."""
+        if self.certainty is None:
+            return None
+        slope, offset = self.certainty
+        return np.asarray(1.0 / (1.0 + np.exp(-slope * logit(scores) - offset)))
 
 
 # --- NanoDet-g 416 with integers of 8 bits on ONNX Runtime: the embedded detector, 80 classes of
@@ -116,7 +130,7 @@ SAME_CLASS_IOU = 0.5
 # Boxes of any classes with a larger overlap show one object.
 ANY_CLASS_IOU = 0.75
 # Fitted by tools/calibration/calibrate_detector.py; see docs/dev/perception.md.
-CALIBRATION = SoftmaxCalibration(temperature=0.35)
+CALIBRATION = SoftmaxCalibration(temperature=0.35, certainty=(2.9, 0.75))
 
 
 class Tables(NamedTuple):
@@ -271,7 +285,7 @@ def combine(
     boxes_xyxy: Float64,
     class_scores: Float64,
     score_threshold: float,
-    calibration: Callable[[Float64], Float64] = CALIBRATION,
+    calibration: SoftmaxCalibration = CALIBRATION,
     masks: Sequence[MaskPatch] | None = None,
 ) -> Detections:
     """`suppress`, with calibrated class distributions.
@@ -280,13 +294,19 @@ def combine(
         boxes_xyxy: (k, 4) pixels.
         class_scores: (k, C) sigmoid scores.
         score_threshold: minimum score of an object.
-        calibration: scores (n, C) to distributions.
+        calibration: of the scores.
         masks: one mask for each candidate; None = the detector has no masks.
     """
     kept, evidence = suppress(boxes_xyxy, class_scores, score_threshold)
     scores = class_scores[kept].max(axis=1) if len(kept) else np.zeros(0)
     kept_masks = None if masks is None else tuple(masks[row] for row in kept)
-    return Detections(boxes_xyxy[kept], calibration(evidence), scores, masks=kept_masks)
+    return Detections(
+        boxes_xyxy[kept],
+        calibration(evidence),
+        scores,
+        masks=kept_masks,
+        certainties=calibration.certainties(scores),
+    )
 
 
 # --- SSDLite-MobileNetV2 with integers of 8 bits: a second opinion.
@@ -367,7 +387,7 @@ CLASS_BIAS = {
     "book": -0.27,
 }
 _NAME_BIAS = BIAS + np.array([CLASS_BIAS.get(name, 0.0) for name in COCO_CLASSES])
-PAIR_CALIBRATION = SoftmaxCalibration(temperature=0.6)
+PAIR_CALIBRATION = SoftmaxCalibration(temperature=0.6, certainty=(2.0, 0.8))
 
 
 class PairDetector:
