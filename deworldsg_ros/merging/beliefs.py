@@ -26,9 +26,9 @@ LABELS = 8
 DRAWN = 0.5
 WRONG = 0.2
 OUTLIERS = 0.4
-# A detector that is wrong says the same wrong name from all sides. So no number of views makes a name
-# more certain than the view that was most certain of it; and all other labels together always keep
-# the probability OTHERS.
+# A detector that is wrong says the same wrong name from all sides. So no number of views makes a
+# name surer than the view that was surest of it; and all other labels together always keep the
+# probability OTHERS.
 OTHERS = 0.05
 
 # The part of a node's record that belongs to its name: the labels (-1 = none), the probability
