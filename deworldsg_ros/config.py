@@ -308,6 +308,15 @@ class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             le=1,
         ),
     ] = 0.5
+    min_name: Annotated[
+        float,
+        option(
+            "minimum probability of the label of a published node; below it, the node is an "
+            "'object' with its classes as guesses; 0 = the most probable class, always",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.5
     publish_tf: Annotated[
         bool,
         option("also publish the boxes of the objects to /tf, as object_ID (needs tf2_msgs)"),
