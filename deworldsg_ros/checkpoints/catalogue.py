@@ -7,13 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from deworldsg_ros.base.files import read_regular
-from deworldsg_ros.config import PerceptionConfig, RelationsConfig
+from deworldsg_ros.config import Config, PerceptionConfig, RelationsConfig
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # --- Published models: name, purpose, source and licence. Needs no torch and no network.
 
 # Folder of the models, below the working directory; config/paper.yaml has its paths there.
 MODELS_FOLDER = Path("models")
+
+
+# Folders of the embedded models.
+_PACKAGE = Path(__file__).parents[1]
+EMBEDDED = (_PACKAGE / "perception" / "weights", _PACKAGE / "relations" / "weights")
 
 
 @dataclass(frozen=True)
@@ -225,6 +230,16 @@ def unused_detector(config: PerceptionConfig, into: Path = MODELS_FOLDER) -> tup
                 f"--set perception.detector={backend} --set perception.detector_path={folder}"
             )
     return "", ""
+
+
+def checkpoints_of(config: Config) -> list[str]:
+    """Folders and hub ids of all checkpoints of a configuration, first those in the package."""
+    perception, relations = config.perception, config.relations
+    names = (
+        *(perception.detector_path, perception.segmenter_path, perception.embedder),
+        *(relations.world_model_path, relations.probe_path),
+    )
+    return [*map(str, EMBEDDED), *filter(None, names)]
 
 
 def is_hub_id(name: str) -> bool:

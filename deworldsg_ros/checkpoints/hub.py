@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +16,7 @@ import msgspec
 
 from deworldsg_ros.base.files import confined, parse_json, write_atomically
 from deworldsg_ros.checkpoints.cards import WEIGHTS_FILE
+from deworldsg_ros.checkpoints.catalogue import is_hub_id
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # --- Names, dtypes and shapes of a checkpoint's parameters, without its weights.
@@ -263,6 +266,37 @@ class Hub:
 def sha256(path: Path) -> str:
     """SHA-256 of a file, hexadecimal."""
     return _digest(path, hashlib.sha256())
+
+
+def fingerprint_of(name: str) -> dict[str, str]:
+    """SHA-256 of each file of a checkpoint by its name; empty if it is not here.
+
+    Hidden files and folders are no part of a checkpoint. A file is hashed once in a process, and
+    again if it was written since.
+
+    Args:
+        name: a folder, or a hub id whose files are in the local cache.
+    """
+    folder = Path(name).expanduser()
+    if not folder.is_dir() and is_hub_id(name):
+        with suppress(ImportError):
+            from huggingface_hub import try_to_load_from_cache
+
+            found = try_to_load_from_cache(name, "config.json")
+            folder = Path(found).parent if isinstance(found, str) else folder
+    paths = [path for path in sorted(folder.glob("[!.]*")) if path.is_file()]
+    return {path.name: _sha256_as_written(path, *_written(path)) for path in paths}
+
+
+def _written(path: Path) -> tuple[int, ...]:
+    """What differs between two contents of a path."""
+    found = path.stat()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+
+
+@lru_cache(1024)
+def _sha256_as_written(path: Path, *written: int) -> str:
+    return sha256(path)
 
 
 def _matches(path: Path, checksum: str) -> bool:
