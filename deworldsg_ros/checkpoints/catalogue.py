@@ -287,9 +287,14 @@ def checkpoints_of(config: Config) -> list[str]:
     return [*map(str, EMBEDDED), *filter(None, names)]
 
 
+# Files that torch wrote. Only `import-fross` and `import-probe` read some.
+ORIGINAL = (".pt", ".pth", ".ckpt")
+
+
 def is_hub_id(name: str) -> bool:
     """Whether the name of a checkpoint has the form of a hub id, ``owner/model``."""
-    return not name.startswith(("/", "~", ".")) and name.count("/") == 1
+    is_path = name.startswith(("/", "~", ".")) or name.endswith(ORIGINAL)
+    return not is_path and name.count("/") == 1
 
 
 def is_folder(name: str) -> bool:
@@ -357,15 +362,31 @@ def missing_world_model(config: RelationsConfig) -> list[str]:
 
 
 def _is_missing(name: str) -> bool:
-    return not is_folder(name) and not is_hub_id(name)
+    return _is_original(name) or (not is_folder(name) and not is_hub_id(name))
+
+
+def _is_original(name: str) -> bool:
+    """Whether a checkpoint is a file of its authors' own layout, or a folder with nothing else."""
+    path = Path(name).expanduser()
+    if not is_folder(name):
+        return name.endswith(ORIGINAL) and path.is_file()
+    files = [file.name for file in path.iterdir()]
+    return "config.json" not in files and any(file.endswith(ORIGINAL) for file in files)
 
 
 def _get(name: str, default: str) -> str:
     """The command that gets a model into the folder of this name."""
     folder = Path(name)
-    model = folder.name if folder.name in CATALOGUE else default
+    same = folder.stem.replace("_", "-") if name.endswith(ORIGINAL) else folder.name
+    model = same if same in CATALOGUE else default
     into = "" if folder.parent == MODELS_FOLDER or not name else f" --into {folder.parent}"
-    return f"run `deworldsg models get {model}{into}`"
+    run = f"run `deworldsg models get {model}{into}`"
+    if not _is_original(name):
+        return run
+    return (
+        f"this is its authors' own layout, which is not read; {run}, which brings the layout of "
+        f"transformers, and set the option to {folder.parent / model}"
+    )
 
 
 def _line(title: str, parameter: str, name: str, advice: str) -> str:

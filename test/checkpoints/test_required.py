@@ -1,6 +1,7 @@
 """Checkpoints that a configuration needs: what is missing is named before anything is loaded."""
 
 import json
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -107,6 +108,24 @@ def test_a_folder_with_some_of_its_shards_is_not_complete(tmp_path):
     assert not is_complete(tmp_path)
     (tmp_path / "model.safetensors").write_text("")
     assert is_complete(tmp_path)
+
+
+def test_weights_in_the_layout_of_their_authors_are_named_with_the_way_out(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    weights = tmp_path / "models" / "sam2.1_hiera_base_plus.pt"
+    weights.parent.mkdir()
+    weights.write_bytes(b"")
+    for path, model in (
+        ("models/sam2.1_hiera_base_plus.pt", "sam2.1-hiera-base-plus"),  # not an id of the hub
+        ("./models/sam2.1_hiera_base_plus.pt", "sam2.1-hiera-base-plus"),
+        ("models", "sam2.1-hiera-tiny"),
+    ):
+        with pytest.raises(Exception, match="its authors' own layout") as error:
+            require_checkpoints(PerceptionConfig(segmenter="sam2", segmenter_path=path))
+        assert f"models get {model}" in str(error.value)
+        assert str(error.value).endswith(f"set the option to {Path(path).parent / model}")
+    (weights.parent / "config.json").write_text("{}")
+    require_checkpoints(PerceptionConfig(segmenter="sam2", segmenter_path="models"))
 
 
 def test_a_probe_of_dinov2_is_trained_and_not_imported(root_dir):
