@@ -313,9 +313,11 @@ class Hub:
                         "removed: run the command again"
                     )
             found[file.name] = sha256(path)
-            if found[file.name] != sums.get(file.name, found[file.name]):
-                path.unlink()  # a small file: the hub has no SHA-256 of it
-            _check(model, file, found[file.name], sums, source)
+            try:
+                _check(model, file, found[file.name], sums, source)
+            except ConfigurationError:  # of a small file, the hub has no SHA-256
+                path.unlink()
+                raise
             report(f"{file.name}: {file.size / 1e6:.1f} MB, {'was there' if known else 'verified'}")
         Lock(model.repository, model.commit, found).write(folder)
 
