@@ -48,16 +48,19 @@ class Published:
 
     def described(self) -> str:
         """Note, size in float32, licence and pins, in words."""
-        size = f"{self.parameters_m:g} million parameters, about {megabytes(4 * self.parameters_m)}"
-        size = size if self.parameters_m else ""
-        pinned = f"commit {self.revision[:12]}" if self.revision else ""
-        pinned += " and SHA-256" if self.sha256 else ""
-        return "; ".join(filter(None, (self.note, size, f"licence {self.licence}", pinned)))
+        parts = [self.note]
+        if self.parameters_m:
+            size = megabytes(4 * self.parameters_m)
+            parts.append(f"{self.parameters_m:g} million parameters, about {size}")
+        parts.append(f"licence {self.licence}")
+        if self.revision:
+            parts.append(f"commit {self.revision[:12]}{' and SHA-256' if self.sha256 else ''}")
+        return "; ".join(filter(None, parts))
 
 
 def megabytes(size_mb: float) -> str:
     """A size in words, to three digits."""
-    return f"{size_mb / 1e3:.2f} GB" if size_mb >= 1e3 else f"{size_mb:.3g} MB"
+    return f"{size_mb / 1e3:.2f} GB" if size_mb >= 999.5 else f"{size_mb:.3g} MB"
 
 
 def _published(owner: str, purpose: str, licence: str, sizes: dict[str, float]) -> list[Published]:
@@ -370,7 +373,7 @@ def _is_original(name: str) -> bool:
     path = Path(name).expanduser()
     if not is_folder(name):
         return name.endswith(ORIGINAL) and path.is_file()
-    files = [file.name for file in path.iterdir()]
+    files = [file.name for file in path.glob("*")]
     return "config.json" not in files and any(file.endswith(ORIGINAL) for file in files)
 
 

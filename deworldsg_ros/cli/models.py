@@ -101,9 +101,11 @@ def _fetch(published: Published, folder: Path, lock: Lock | None, console: Conso
         hub = Hub()
         model = hub.find(published.repository, lock.commit if lock else published.revision)
     except ConfigurationError as error:
-        if lock or pins or not is_complete(folder):
+        # The weights of an entry with a SHA-256 need no hub.
+        if lock or not is_complete(folder) or (pins and not Lock("", "", pins).holds(folder)):
             raise
-        console.print(f"{folder}: complete, and not verified: no {Lock.path(folder)}; {error}")
+        known = "verified by the SHA-256 of its weights" if pins else "not verified"
+        console.print(f"{folder}: complete, and {known}: no {Lock.path(folder)}; {error}")
         return
     console.print(
         f"{model.repository}, commit {model.commit[:12]}, licence {model.licence}, "
@@ -419,7 +421,7 @@ def get(
 
 @app.command("list")
 def list_command(into: IntoFolder = MODELS_FOLDER) -> None:
-    """List models that are there or missing, with their licences."""
+    """List models that are there or missing, with sizes and licences."""
     with _terminal() as console:
         list_models(into, console)
 

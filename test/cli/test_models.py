@@ -143,6 +143,12 @@ def test_a_pinned_entry_is_fetched_and_another_content_refused(hub, tmp_path, mo
     refused = refusal("models", "get", "dinov2-small", "--into", tmp_path)
     assert f"the catalogue expects sha256:{digest}" in refused and hub.requested == []
     assert (tmp_path / "dinov2-small/model.safetensors").read_bytes() == WEIGHTS
+    lock.unlink()
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    assert "verified by the SHA-256 of its weights" in get(tmp_path)
+    (tmp_path / "dinov2-small/model.safetensors").write_bytes(other)
+    assert "cannot be fetched" in refusal("models", "get", "dinov2-small", "--into", tmp_path)
+    monkeypatch.setenv("HF_ENDPOINT", hub.url)
     other = replace(pinned, revision="f" * 40)
     monkeypatch.setitem(CATALOGUE, "dinov2-small", other)
     assert "cannot be fetched" in refusal("models", "get", "dinov2-small", "--into", tmp_path)

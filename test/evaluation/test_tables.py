@@ -100,7 +100,7 @@ def test_the_fingerprint_depends_on_the_inputs_and_not_on_the_folder(root, tmp_p
     assert tables.fingerprint(job(root, tmp_path, **changes).task) != known
 
 
-def test_weights_that_were_replaced_at_their_path_are_another_input(root, tmp_path):
+def test_weights_that_were_replaced_at_their_path_are_another_input(root, tmp_path, monkeypatch):
     folder = tmp_path / "probe"
     config = msgspec.structs.replace(Config(), relations=RelationsConfig(probe_path=str(folder)))
     one = job(root, tmp_path / "out", config=config)
@@ -118,6 +118,10 @@ def test_weights_that_were_replaced_at_their_path_are_another_input(root, tmp_pa
     assert [reused(lambda: weights(b"one")), reused(lambda: weights(b"two"))] == [True, False]
     assert not reused(lambda: weights(b"{}", "config.json"))
     assert reused(lambda: (folder / ".cache").mkdir())
+    # Weights that are replaced during a run did not make its result.
+    outcome = run_job(one).outcome
+    monkeypatch.setattr(tables, "evaluate_scan", lambda task: weights(b"new") or outcome)
+    assert [reused(lambda: weights(b"old")), reused(lambda: None)] == [False, False]
 
 
 class Deadly:
