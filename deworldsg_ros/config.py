@@ -134,7 +134,8 @@ class LiftingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Literal["refined", "mask", "box"],
         option(
             "pixels of an object: refined = mask with depth refinement (Eq. 1-2), mask = mask "
-            "only, box = box only; mask and box are the paper's ablation"
+            "only, box = the one at the centre of its box, as FROSS; mask and box are the paper's "
+            "ablation"
         ),
     ] = "refined"
 
