@@ -74,14 +74,13 @@ class Detections:
             certainties=None if self.certainties is None else self.certainties[rows],
         )
 
-    def doubted(self) -> Float64:
-        """The class distributions (n, C) with the rest of the certainties on all classes."""
+    def doubted(self) -> Detections:
+        """With the certainties in the class distributions: what is left is on all classes."""
         if self.certainties is None:
-            return self.class_probabilities
-        certain = self.certainties[:, None]
-        return (
-            certain * self.class_probabilities + (1.0 - certain) / self.class_probabilities.shape[1]
-        )
+            return self
+        certain, classes = self.certainties[:, None], self.class_probabilities
+        mixed = certain * classes + (1.0 - certain) / classes.shape[1]
+        return replace(self, class_probabilities=mixed, certainties=None)
 
 
 def unit_embeddings(vectors: Float32, rows: Int64, model: str) -> Embeddings:

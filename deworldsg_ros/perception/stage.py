@@ -74,8 +74,9 @@ def _turned_back_once(boxes_xyxy: Float64, height: int) -> Float64:
 #
 # Suppression by IoU keeps a small box inside a large one of the same class.
 
-# Two objects have one class if the dot product of their class distributions exceeds this.
-SAME_CLASS = 0.3
+# Two objects have one class if the cosine of their class distributions exceeds this: how certain
+# the names are does not matter.
+SAME_CLASS = 0.5
 # A box is nested if more than this fraction of it is inside another: edges are a few pixels off.
 NESTED_FRACTION = 0.8
 # A part has less than this fraction of the area of the whole. From there on the IoU is 0.5 or more,
@@ -158,7 +159,9 @@ def _compare(a: Detections, b: Detections) -> tuple[Bool, Bool, Bool]:
     area_a, area_b = areas(a.boxes_xyxy), areas(b.boxes_xyxy)
     shared = shared_areas(a.boxes_xyxy, b.boxes_xyxy)
     inside = (shared > NESTED_FRACTION * area_a[:, None]) & (area_a[:, None] < area_b[None, :])
-    same_class = a.class_probabilities @ b.class_probabilities.T > SAME_CLASS
+    p, q = a.class_probabilities, b.class_probabilities
+    lengths = np.outer(np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1))
+    same_class = p @ q.T > SAME_CLASS * lengths
     return inside, shared > 0, same_class
 
 
@@ -525,7 +528,7 @@ class Perception:
             height=intrinsics.height,
             vocabulary=self.vocabulary,
             boxes_xyxy=objects.boxes_xyxy,
-            class_probabilities=objects.doubted() if self._refine else objects.class_probabilities,
+            class_probabilities=objects.class_probabilities,
             scores=objects.scores,
             relations=relations,
             colours_lab=mean_colours(frame.rgb, instances, [mask.window for mask in masks]),
@@ -556,7 +559,8 @@ class Perception:
         if self._source is not None and frame.sent is not None:
             return self._source.take(frame.sent, fraction * self.score_threshold)
         try:
-            return self._detector.detect(frame.rgb, fraction * self.score_threshold)
+            found = self._detector.detect(frame.rgb, fraction * self.score_threshold)
+            return found.doubted() if self._refine else found
         except RefusedInput:
             raise
         except Exception as error:  # a model can fail in more ways than can be listed

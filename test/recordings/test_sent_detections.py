@@ -51,7 +51,8 @@ def test_the_detector_gives_the_same_graph_from_a_topic(detected, tmp_path):
     found, classes = detected
     items = {}
     for stamp_ns, one in found.items():
-        message = wire_message(named(one, classes, full=True), stamp_ns)
+        # A source says how certain its names are by their distribution.
+        message = wire_message(named(one.doubted(), classes, full=True), stamp_ns)
         for item, score in zip(message.detections, one.scores.tolist()):
             item.score = score
         items[stamp_ns] = json_item(message)

@@ -230,12 +230,12 @@ def test_a_name_is_as_certain_as_its_score_says() -> None:
     scores = np.array([[0.8, 0.1, 0.1], [0.45, 0.1, 0.1]])
     boxes = np.array([[0.0, 0.0, 9.0, 9.0], [50.0, 50.0, 90.0, 90.0]])
     plain = combine(boxes, scores, 0.3, SoftmaxCalibration(0.35))
-    assert plain.certainties is None and plain.doubted() is plain.class_probabilities
+    assert plain.certainties is None and plain.doubted() is plain
     found = combine(boxes, scores, 0.3, SoftmaxCalibration(0.35, certainty=(2.0, 0.5)))
     assert found.certainties is not None
     odds = found.certainties / (1 - found.certainties)
     np.testing.assert_allclose(odds, math.exp(0.5) * (scores[:, 0] / (1 - scores[:, 0])) ** 2)
-    doubted = found.doubted()
+    doubted = found.doubted().class_probabilities
     np.testing.assert_allclose(doubted.sum(axis=1), 1.0)
     rest = (1 - found.certainties) / 3
     expected = found.certainties * plain.class_probabilities[:, 0] + rest
