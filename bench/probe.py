@@ -60,7 +60,7 @@ def labelled(pair: PairClip, number: int) -> LabelledClip:
     context = request.pairs[0]
     boxes = relative_box_pair(context.subject_box_xyxy, context.object_box_xyxy, width, height)
     name = f"{pair.room} {number}"
-    return LabelledClip(name, pair.room, name, pair.predicate, boxes, lambda: request.clip)
+    return LabelledClip(name, pair.room, name, (pair.predicate,), boxes, lambda: request.clip)
 
 
 def ambiguous_logits(truth: np.ndarray, generator: np.random.Generator) -> np.ndarray:

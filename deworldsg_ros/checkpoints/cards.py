@@ -148,8 +148,9 @@ def graph_predicates(config: PerceptionConfig) -> Union[tuple[str, ...], None]:
 PROBE_CARD = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 
-# The frames of a clip, see `ProbeCard`.
+# The frames of a clip, and the region of them, see `ProbeCard`.
 Window = Literal["last_frames", "valid_interval"]
+Crop = Literal["last_frame", "clip_union", "each_frame"]
 
 # Inputs for the two boxes of a pair: four corner coordinates each, as fractions of the crop.
 BOX_INPUTS = 8
@@ -198,6 +199,9 @@ class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         hidden_dim: width of the hidden layer.
         window: frames of its clips: ``last_frames`` = the last T frames; ``valid_interval`` = those
             of them since both objects were seen without a break.
+        crop: region of its clips: ``last_frame`` is the paper's, the union box of the last frame in
+            all frames; ``clip_union`` = the union of the boxes of all frames; ``each_frame`` = in
+            each frame its own union box, resized to that of the last.
         training: record of the training, plain values.
         schema, version: of the file format.
     """
@@ -208,6 +212,7 @@ class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     inputs: Literal["clip", "clip_and_boxes"] = "clip"
     hidden_dim: Annotated[int, msgspec.Meta(ge=1)] = 512
     window: Window = "last_frames"
+    crop: Crop = "last_frame"
     training: dict[str, Any] = {}
     schema: Literal["deworldsg/probe"] = "deworldsg/probe"
     version: Literal[1] = 1
@@ -219,10 +224,10 @@ class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def seen_groups(self) -> frozenset[str]:
-        """Scans or rooms that decided the weights, in the training or by stopping it."""
-        groups = self.training.get("groups_by_part", {})
-        parts = [groups.get(part, ()) for part in ("train", "validation")]
-        return frozenset(str(group) for part in parts for group in part)
+        """Scans and rooms that decided the weights, in the training or by stopping it."""
+        records = [self.training.get(f"{unit}_by_part", {}) for unit in ("groups", "scans")]
+        parts = [record.get(part, ()) for record in records for part in ("train", "validation")]
+        return frozenset(str(name) for part in parts for name in part)
 
     def require_backbone(self, backbone: BackboneIdentity) -> None:
         """Raise ConfigurationError unless the probe was trained on this backbone.
@@ -279,7 +284,8 @@ def read_probe_card(folder: Path) -> ProbeCard:
         card.seen_groups  # noqa: B018  the record of the training has any values
     except (AttributeError, TypeError) as error:
         raise ConfigurationError(
-            f"probe {path}: training.groups_by_part is no record of scans by part ({error})"
+            f"probe {path}: training.groups_by_part or scans_by_part is no record of names by part "
+            f"({error})"
         ) from error
     if not card.predicates or len(set(card.predicates)) != len(card.predicates):
         raise ConfigurationError(f"probe {path}: expected predicates, each name once")

@@ -63,6 +63,29 @@ Window = Annotated[
         "objects were seen without a break)",
     ),
 ]
+Crop = Annotated[
+    str,
+    typer.Option(
+        "--crop",
+        help="region of a clip of a data set: last_frame (the paper: the union box of the last "
+        "frame, in all frames), clip_union (of the boxes of all frames), or each_frame",
+    ),
+]
+GeoCost = Annotated[
+    float,
+    typer.Option(
+        "--geo-cost-threshold",
+        help="clips of a data set end with a frame in which the pair has a lower cost (Eq. 8)",
+    ),
+]
+ClassWeights = Annotated[
+    str,
+    typer.Option(
+        "--class-weights",
+        help="none (the paper: the probe learns how frequent predicates are), or "
+        "inverse_frequency, which makes rare ones more probable than they are",
+    ),
+]
 DataSplit = Annotated[
     str,
     typer.Option(
@@ -78,7 +101,10 @@ HeldOut = Annotated[
 HeldOutFraction = Annotated[
     float,
     typer.Option(
-        "--held-out-fraction", min=0, max=0.9, help="fraction of the rooms to hold out instead"
+        "--held-out-fraction",
+        min=0,
+        max=0.9,
+        help="fraction of the rooms to hold out instead; 0 trains on all, for --epochs passes",
     ),
 ]
 ClipsPerPair = Annotated[
@@ -87,7 +113,9 @@ ClipsPerPair = Annotated[
 ClipLength = Annotated[int, typer.Option("--clip-length", min=1, help="frames per clip")]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda")]
 BatchSize = Annotated[int, typer.Option("--batch-size", min=1, help="clips encoded at once")]
-Epochs = Annotated[int, typer.Option("--epochs", min=1, help="maximum number of passes")]
+Epochs = Annotated[
+    Optional[int], typer.Option("--epochs", min=1, help="maximum number of passes; default 200")
+]
 Patience = Annotated[
     int,
     typer.Option(
@@ -141,6 +169,9 @@ def train_probe(
     layout: Layout = "two_layer",
     inputs: Inputs = "clip",
     window: Window = "last_frames",
+    crop: Crop = "last_frame",
+    geo_cost_threshold: GeoCost = RelationsConfig().geo_cost_threshold,
+    class_weights: ClassWeights = "none",
     split: DataSplit = "train",
     held_out: HeldOut = None,
     held_out_fraction: HeldOutFraction = 0.2,
@@ -148,7 +179,7 @@ def train_probe(
     clip_length: ClipLength = 16,
     device: Device = "auto",
     batch_size: BatchSize = 1,
-    epochs: Epochs = 200,
+    epochs: Epochs = None,
     patience: Patience = 20,
     learning_rate: LearningRate = 1e-3,
     seed: Seed = 0,
@@ -160,15 +191,28 @@ def train_probe(
         "world_model": world_model,
         "world_model_path": model,
         "clip_length": clip_length,
+        "geo_cost_threshold": geo_cost_threshold,
     }
+    if not held_out and not held_out_fraction and epochs is None:
+        raise ConfigurationError(
+            "--held-out-fraction 0 trains on all rooms, and none is left to stop the training: "
+            "give --epochs, e.g. the best epoch of a training that holds some out"
+        )
     training = TrainingOptions(
         layout=_one_of("layout", layout, ("two_layer", "batch_norm")),
         inputs=_one_of("inputs", inputs, ("clip", "clip_and_boxes")),
         window=_one_of("window", window, ("last_frames", "valid_interval")),
+        crop=_one_of("crop", crop, ("last_frame", "clip_union", "each_frame")),
         held_out_fraction=held_out_fraction,
         held_out_groups=tuple(held_out or ()),
         batch_size=batch_size,
-        fit=FitOptions(epochs, patience, learning_rate=learning_rate, seed=seed),
+        fit=FitOptions(
+            epochs or FitOptions.epochs,
+            patience,
+            learning_rate=learning_rate,
+            seed=seed,
+            class_weights=_one_of("class-weights", class_weights, ("none", "inverse_frequency")),
+        ),
     )
     options = ProbeTraining(
         source=source,
@@ -197,6 +241,8 @@ def run_training(options: ProbeTraining, console: Console) -> None:
         options.clips_per_pair,
         options.data_split,
         options.training.window,
+        options.training.crop,
+        options.relations.geo_cost_threshold,
     )
     clips = read_clips(options.source, choice)
     backbone = _load_backbone(options)
@@ -204,8 +250,10 @@ def run_training(options: ProbeTraining, console: Console) -> None:
         encoding = bar.add_task("features", total=len(clips), note="")
         fitting = bar.add_task("epochs", total=options.training.fit.epochs, note="")
 
-        def epoch(train_loss: float, validation_loss: float) -> None:
-            note = f"loss {train_loss:.3f}, validation {validation_loss:.3f}"
+        def epoch(train_loss: float, validation_loss: float | None) -> None:
+            note = f"loss {train_loss:.3f}"
+            if validation_loss is not None:
+                note += f", validation {validation_loss:.3f}"
             bar.update(fitting, advance=1, note=note)
 
         metrics = train(
@@ -220,11 +268,15 @@ def run_training(options: ProbeTraining, console: Console) -> None:
             ),
             progress=Progress(lambda count: bar.update(encoding, advance=count), epoch),
         )
-    held = metrics["held_out"]
+    held = metrics.get("held_out")
     console.print(
         f"{options.out}: best epoch {metrics['best_epoch'] + 1}; {held['clips']} clips of held-out "
         f"rooms: macro accuracy {held['macro_accuracy']:.3f} (chance {held['chance_macro']:.3f}), "
-        f"micro {held['micro_accuracy']:.3f} (most frequent {held['majority_micro']:.3f})",
+        f"micro {held['micro_accuracy']:.3f} (most frequent {held['majority_micro']:.3f}), "
+        f"log loss {held['log_loss_nats']:.3f} nats"
+        if held
+        else f"{options.out}: trained on all {metrics['train']['clips']} clips for "
+        f"{metrics['best_epoch'] + 1} epochs; no room was held out to measure it",
         markup=False,
     )
     relations = options.relations

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -42,7 +42,7 @@ from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.errors import EvaluationError, RefusedInput
+from deworldsg_ros.scene.errors import EvaluationError, RecordingError, RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.wire import messages as wire
 
@@ -292,19 +292,21 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
         task.config.perception if uses_perception else None,
         task.config.relations if task.method == PIPELINE else None,
     )
-    if task.method == PIPELINE:
-        warn_of_training(task.config.relations, task.scan)
     with ExitStack() as opened:
         return _evaluate(task, opened)
 
 
-def warn_of_training(config: RelationsConfig, scan: str) -> None:
-    """Log a warning if the configured probe was trained on this scan."""
+def warn_of_training(config: RelationsConfig, annotations: Annotations, scan: str) -> None:
+    """Log a warning if the configured probe was trained on this scan or on its room."""
     if config.world_model not in WORLD_MODELS:
         return
-    if scan in read_probe_card(Path(config.probe_path).expanduser()).seen_groups:
+    places = {scan}
+    with suppress(RecordingError):  # 3RScan may lack the list of its rooms
+        places.add(annotations.room(scan))
+    if places & read_probe_card(Path(config.probe_path).expanduser()).seen_groups:
         logger.warning(
-            "scan %s was in the training of probe %s: its figures say nothing about other scans",
+            "scan %s or its room was in the training of probe %s: its figures say nothing about "
+            "other rooms",
             scan,
             config.probe_path,
         )
@@ -312,6 +314,8 @@ def warn_of_training(config: RelationsConfig, scan: str) -> None:
 
 def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
     annotations = open_annotations(task.root, task.layout)
+    if task.method == PIPELINE:
+        warn_of_training(task.config.relations, annotations, task.scan)
     annotation = annotations.scan(task.scan)
     points = annotations.points(task.scan, aligned=task.options.aligned_ply)
     reference = read_reference(annotations, task.scan, points)

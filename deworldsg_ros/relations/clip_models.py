@@ -38,8 +38,8 @@ from deworldsg_ros.scene.errors import ConfigurationError
 # --- Preprocessing of clips: stretch a crop to the square input, normalise as for ImageNet.
 #
 # The backbones' published processors use the middle of an image only. In a crop around two objects,
-# the objects are at the sides: on the shipped recording the middle loses 56 % of their area, and in
-# three of ten clips one object altogether (`bench/clip_fit.py`). The released code of the paper
+# the objects are at the sides: on the shipped recording the middle loses 58 % of their area, and in
+# a third of the clips one object altogether (`bench/clip_fit.py`). The released code of the paper
 # stretches, too. Pixels are copied to the device as uint8, a quarter of the bytes of float32.
 
 
@@ -326,7 +326,7 @@ class ProbedWorldModel:
         name: family of the backbone.
         clip_length: T, frames of a clip.
         predicates: names of the probe's outputs.
-        window: frames of a clip, see `ProbeCard`.
+        window, crop: frames of a clip and region of them, see `ProbeCard`.
 
     Raises:
         ConfigurationError: the probe was trained on another backbone.
@@ -337,7 +337,7 @@ class ProbedWorldModel:
         self.name = backbone.identity.family
         self.clip_length = backbone.identity.clip_length
         self.predicates = probe.card.predicates
-        self.window = probe.card.window
+        self.window, self.crop = probe.card.window, probe.card.crop
         self._backbone = backbone
         self._probe = probe
 
@@ -397,11 +397,13 @@ def build_probed(
             config.probe_path,
             config.world_model_path,
         )
-    if config.edge_belief == "paper" and probe.card.inputs != "clip":
+    choice = probe.card.inputs, probe.card.crop
+    if config.edge_belief == "paper" and choice != ("clip", "last_frame"):
         logger.warning(
-            "probe %s gets '%s'. The paper's probe gets the clip only: these are not the paper's "
-            "results. For those, use a probe trained with --inputs clip",
+            "probe %s gets '%s' of '%s'. The paper's probe gets the clip only, in the region of "
+            "its last frame: these are not the paper's results. For those, use a probe trained "
+            "with --inputs clip --crop last_frame",
             config.probe_path,
-            probe.card.inputs,
+            *choice,
         )
     return model

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from deworldsg_ros.checkpoints.cards import Crop
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import DECIMALS
@@ -30,6 +31,9 @@ from deworldsg_ros.wire.follow import GraphReplica
 
 Rgb = UInt8
 CropBox = tuple[int, int, int, int]
+# The boxes of a pair in a frame, each (4,) float64 xyxy pixels; None = not seen.
+BoxPair = tuple[Float64 | None, Float64 | None]
+NO_BOXES: Float64 = np.zeros((0, 4))
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class QueuedClip:
     Attributes:
         stamp_ns: last frame in which both objects were seen.
         frame_stamps_ns: the clip's frames, oldest first; the last is `stamp_ns`.
-        crop_xyxy: union box of the two objects in that last frame, whole pixels.
+        regions_xyxy: its region of each frame, whole pixels, e.g. the union box of the two objects.
         vocabulary: of the frame's local graph.
         rows: rows of the two objects in that local graph, the smaller first.
         classes: indices of their classes.
@@ -47,26 +51,24 @@ class QueuedClip:
         geo_cost: the geometric cost of Eq. 8.
         pixels: (T, h, w, 3) uint8, the cropped clip; None while its frames are in the frame
             buffer.
-        skipped: number of its first frames that are left out.
     """
 
     stamp_ns: int
     frame_stamps_ns: tuple[int, ...]
-    crop_xyxy: CropBox
+    regions_xyxy: tuple[CropBox, ...]
     vocabulary: Vocabulary
     rows: tuple[int, int]
     classes: tuple[int, int]
     boxes_xyxy: tuple[Float64, Float64]
     geo_cost: float
     pixels: Rgb | None = None
-    skipped: int = 0
 
 
 class FrameBuffer:
-    """The last frames of the RGB stream, ordered by stamp, kept by reference.
+    """The last frames of the RGB stream with the boxes of their objects, ordered by stamp.
 
-    Do not change an image after adding it. An image of another size than the stored ones replaces
-    them all: the camera has changed, and a clip cannot mix two sizes.
+    Images are kept by reference: do not change one after adding it. An image of another size than
+    the stored ones replaces them all: the camera has changed, and a clip cannot mix two sizes.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -75,12 +77,13 @@ class FrameBuffer:
         self.capacity = capacity
         self._stamps_ns: list[int] = []
         self._images: dict[int, Rgb] = {}
+        self._boxes_xyxy: dict[int, Float64] = {}
 
     def __len__(self) -> int:
         return len(self._stamps_ns)
 
-    def add(self, stamp_ns: int, rgb: Rgb) -> None:
-        """Keep one image, (H, W, 3) uint8; a full buffer drops its oldest image.
+    def add(self, stamp_ns: int, rgb: Rgb, boxes_xyxy: Float64 = NO_BOXES) -> None:
+        """Keep one image, (H, W, 3) uint8, and boxes (n, 4); a full buffer drops its oldest image.
 
         A full buffer ignores an image older than all of its own. An image whose stamp is already
         here is ignored, too.
@@ -91,8 +94,16 @@ class FrameBuffer:
             self.clear()
         insort(self._stamps_ns, stamp_ns)
         self._images[stamp_ns] = rgb
+        self._boxes_xyxy[stamp_ns] = boxes_xyxy
         if len(self._stamps_ns) > self.capacity:
-            del self._images[self._stamps_ns.pop(0)]
+            oldest_ns = self._stamps_ns.pop(0)
+            del self._images[oldest_ns], self._boxes_xyxy[oldest_ns]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the images, pixels; there is at least one."""
+        height, width = self._images[self._stamps_ns[-1]].shape[:2]
+        return width, height
 
     def leaving(self, stamp_ns: int) -> int | None:
         """Stamp of the frame that an image with this stamp would replace; None if none."""
@@ -115,10 +126,15 @@ class FrameBuffer:
             return None
         return [self._images[stamp_ns] for stamp_ns in stamps_ns]
 
+    def boxes(self, stamp_ns: int) -> Float64:
+        """Boxes (n, 4) float64 of the objects in a frame; none of a frame that has left."""
+        return self._boxes_xyxy.get(stamp_ns, NO_BOXES)
+
     def clear(self) -> None:
         """Drop all frames."""
         self._stamps_ns.clear()
         self._images.clear()
+        self._boxes_xyxy.clear()
 
 
 def union_box(box_a_xyxy: Float64, box_b_xyxy: Float64, width: int, height: int) -> CropBox:
@@ -164,18 +180,38 @@ def interval_start(seen: Sequence[bool | None]) -> int:
     return start
 
 
-def without_first(clip: Rgb, count: int) -> Rgb:
-    """A clip (T, h, w, 3) without its first frames, filled with copies of its last frame."""
-    return np.concatenate([clip[count:], np.repeat(clip[-1:], count, axis=0)]) if count else clip
+def clip_regions(
+    boxes_xyxy: Sequence[BoxPair], crop: Crop, width: int, height: int
+) -> tuple[CropBox, ...]:
+    """The region of each frame of a clip. An unseen object has its box of the next frame.
+
+    Args:
+        boxes_xyxy: of the pair in each frame, oldest first; in the last both are seen.
+        crop: see `ProbeCard`.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+    unions: list[CropBox] = []
+    a, b = boxes_xyxy[-1]
+    for seen_a, seen_b in reversed(boxes_xyxy if crop != "last_frame" else boxes_xyxy[-1:]):
+        a, b = a if seen_a is None else seen_a, b if seen_b is None else seen_b
+        if a is None or b is None:
+            raise ValueError("the last frame of a clip shows one object: expected both")
+        unions.append(union_box(a, b, width, height))
+    if crop == "each_frame":
+        return tuple(reversed(unions))
+    x1, y1, x2, y2 = zip(*unions)
+    return ((min(x1), min(y1), max(x2), max(y2)),) * len(boxes_xyxy)
 
 
-def crop_clip(images: Sequence[Rgb], crop_xyxy: CropBox, length: int) -> Rgb:
+def crop_clip(images: Sequence[Rgb], regions_xyxy: Sequence[CropBox], length: int) -> Rgb:
     """A clip of fixed length, cropped out of frames.
 
     Args:
         images: 1 to `length` images (H, W, 3) uint8, oldest first; the last is the most recent
             frame in which both objects were seen.
-        crop_xyxy: box of whole pixels in those images, far edges exclusive.
+        regions_xyxy: box of whole pixels in each image, far edges exclusive; a region of another
+            size than the last is resized to that.
         length: T, frames of the clip; the last image is repeated at the end to fill it.
 
     Returns:
@@ -186,10 +222,15 @@ def crop_clip(images: Sequence[Rgb], crop_xyxy: CropBox, length: int) -> Rgb:
     """
     if not 1 <= len(images) <= length:
         raise ValueError(f"clip of {len(images)} frames: expected 1 to {length}")
-    x1, y1, x2, y2 = crop_xyxy
-    clip = np.empty((length, y2 - y1, x2 - x1, 3), np.uint8)
-    for row, image in enumerate(images):
-        clip[row] = image[y1:y2, x1:x2]
+    import cv2  # slow: graph_node, which cuts no clip, starts without it
+
+    x1, y1, x2, y2 = regions_xyxy[-1]
+    size = (x2 - x1, y2 - y1)
+    clip = np.empty((length, size[1], size[0], 3), np.uint8)
+    for row, (image, (x1, y1, x2, y2)) in enumerate(zip(images, regions_xyxy)):
+        part = image[y1:y2, x1:x2]
+        same = (x2 - x1, y2 - y1) == size
+        clip[row] = part if same else cv2.resize(part, size, interpolation=cv2.INTER_AREA)
     clip[len(images) :] = clip[len(images) - 1]
     return clip
 
@@ -597,21 +638,29 @@ class ClipQueue:
         """The number of clips that may be encoded now."""
         return self._policy.allowance(sum(rank.ready for rank, _ in self._sift()))
 
-    def cut(self, leaving_ns: int, frames: FrameBuffer, clip_length: int) -> None:
+    def cut(
+        self,
+        leaving_ns: int,
+        frames: FrameBuffer,
+        clip_length: int,
+        choose: Callable[[QueuedClip], QueuedClip] = lambda clip: clip,
+    ) -> None:
         """Cut clips of known pairs before the frame with this stamp leaves the buffer.
 
         The only clip of a pair that waits for confirmation or for the budget is so kept. Clips
-        whose pair is not known yet become stale: newer ones will follow.
+        whose pair is not known yet become stale: newer ones will follow. `choose` gives a clip its
+        frames and regions.
         """
         bytes_left = MAX_CUT_BYTES
         kept: list[QueuedClip] = []
         for rank, clip in self._sift():
             if clip.pixels is None and clip.frame_stamps_ns[0] <= leaving_ns:
-                images = None if rank.pair is None else frames.images(clip.frame_stamps_ns)
-                if images is None:
+                clip = clip if rank.pair is None else choose(clip)
+                images = frames.images(clip.frame_stamps_ns)
+                if rank.pair is None or images is None:
                     self._on_drop("stale")
                     continue
-                clip = replace(clip, pixels=crop_clip(images, clip.crop_xyxy, clip_length))
+                clip = replace(clip, pixels=crop_clip(images, clip.regions_xyxy, clip_length))
             if clip.pixels is not None:
                 bytes_left -= clip.pixels.nbytes
                 if bytes_left < 0:

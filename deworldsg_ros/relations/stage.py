@@ -11,18 +11,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from deworldsg_ros.base.plugins import PluginError, load_plugin
+from deworldsg_ros.checkpoints.cards import Crop
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.clips import (
+    BoxPair,
     ClipPolicy,
     ClipQueue,
     FrameBuffer,
     GraphView,
     QueuedClip,
     Rgb,
+    clip_regions,
     crop_clip,
     interval_start,
     union_box,
-    without_first,
 )
 from deworldsg_ros.relations.paper import neighbour_pairs
 from deworldsg_ros.relations.world_model import ClipRequest, FakeWorldModel, PairContext, WorldModel
@@ -95,7 +97,7 @@ class ClipEncoder:
 
 def clip_request(clip: QueuedClip, images: list[Rgb], clip_length: int) -> ClipRequest:
     """The pixels of a queued clip and both directions of its pair, in pixels of the crop."""
-    x1, y1, _, _ = clip.crop_xyxy
+    x1, y1, _, _ = clip.regions_xyxy[-1]
     boxes = [box - np.array([x1, y1, x1, y1], np.float64) for box in clip.boxes_xyxy]
     names = [clip.vocabulary.classes[index] for index in clip.classes]
     directions = tuple(
@@ -111,8 +113,8 @@ def clip_request(clip: QueuedClip, images: list[Rgb], clip_length: int) -> ClipR
     )
     pixels = clip.pixels
     if pixels is None:
-        pixels = crop_clip(images, clip.crop_xyxy, clip_length)
-    return ClipRequest(without_first(pixels, clip.skipped), directions, clip.vocabulary)
+        pixels = crop_clip(images, clip.regions_xyxy, clip_length)
+    return ClipRequest(pixels, directions, clip.vocabulary)
 
 
 def checked_distributions(output: Float64, pair_count: int, predicate_count: int) -> Float64:
@@ -208,6 +210,7 @@ class RelationReasoner:
         self._config = config
         self._encoder = None if world_model is None else ClipEncoder(world_model, report)
         self._valid_only = getattr(world_model, "window", "") == "valid_interval"
+        self._crop: Crop = getattr(world_model, "crop", "last_frame")
         self._graph: GraphView | None = None
         self._lock = threading.Lock()
         self._frames = FrameBuffer(BUFFERED_CLIP_LENGTHS * config.clip_length)
@@ -316,7 +319,7 @@ class RelationReasoner:
         with self._lock:
             # Boxes are in pixels: they do not fit an image of another size.
             if rgb.shape[:2] == (local.height, local.width):
-                self._keep(local.stamp_ns, rgb)
+                self._keep(local, rgb)
             self._policy.advance(local.stamp_ns)
             stamps_ns = self._frames.window(local.stamp_ns, self._config.clip_length)
             if not stamps_ns:
@@ -329,12 +332,12 @@ class RelationReasoner:
                 for row in once.tolist()
             )
 
-    def _keep(self, stamp_ns: int, rgb: Rgb) -> None:
+    def _keep(self, local: LocalGraph, rgb: Rgb) -> None:
         """Keep an image. Clips that need the frame it replaces are cut first."""
-        leaving_ns = self._frames.leaving(stamp_ns)
+        leaving_ns = self._frames.leaving(local.stamp_ns)
         if leaving_ns is not None:
-            self._queue.cut(leaving_ns, self._frames, self._config.clip_length)
-        self._frames.add(stamp_ns, rgb)
+            self._queue.cut(leaving_ns, self._frames, self._config.clip_length, self._chosen)
+        self._frames.add(local.stamp_ns, rgb, local.boxes_xyxy)
 
     def _drop(self, reason: str) -> None:
         self._dropped[reason] += 1
@@ -343,26 +346,47 @@ class RelationReasoner:
         """The first clip that is ready, and its frames (none if the clip holds its pixels)."""
         with self._lock:
             while (clip := self._queue.take()) is not None:
+                if clip.pixels is not None:
+                    return clip, []
+                clip = self._chosen(clip)
                 images = self._frames.images(clip.frame_stamps_ns)
-                if images is not None or clip.pixels is not None:
-                    return replace(clip, skipped=self._invalid(clip)), images or []
+                if images is not None:
+                    return clip, images
                 self._drop("stale")  # images of another size have replaced its frames
         return None
 
-    def _invalid(self, clip: QueuedClip) -> int:
-        """Number of first frames that the world model wants left out.
+    def _chosen(self, clip: QueuedClip) -> QueuedClip:
+        """A clip with the frames and regions that the world model wants, see `ProbeCard`.
 
-        The graph knows which objects a frame shows. Without it, all frames count as valid.
+        The graph knows which objects a frame shows. Without it, a clip has all frames and the
+        region of the last one.
         """
-        if not self._valid_only or self._graph is None:
-            return 0
+        if self._graph is None or not (self._valid_only or self._crop != "last_frame"):
+            return clip
         nodes_of_frame = self._graph.nodes_of_frame
         nodes = nodes_of_frame(clip.stamp_ns)
         if nodes is None or max(clip.rows) >= len(nodes):
-            return 0
-        pair = {nodes[row] for row in clip.rows}
+            return clip
+        pair = [nodes[row] for row in clip.rows]
+        if not all(pair):  # a removed node
+            return clip
         frames = [nodes_of_frame(stamp_ns) for stamp_ns in clip.frame_stamps_ns]
-        return interval_start([None if ids is None else pair <= set(ids) for ids in frames])
+        if self._valid_only:
+            seen = [None if ids is None else set(pair) <= set(ids) for ids in frames]
+            first = interval_start(seen)
+            frames = frames[first:]
+            stamps_ns, regions = clip.frame_stamps_ns[first:], clip.regions_xyxy[first:]
+            clip = replace(clip, frame_stamps_ns=stamps_ns, regions_xyxy=regions)
+        if self._crop == "last_frame":
+            return clip
+        boxes: list[BoxPair] = []
+        for ids, stamp_ns in zip(frames, clip.frame_stamps_ns):
+            own = self._frames.boxes(stamp_ns)
+            rows = [-1 if ids is None or node not in ids else ids.index(node) for node in pair]
+            a, b = (own[row] if 0 <= row < len(own) else None for row in rows)
+            boxes.append((a, b))
+        regions = clip_regions([*boxes[:-1], clip.boxes_xyxy], self._crop, *self._frames.size)
+        return replace(clip, regions_xyxy=regions)
 
 
 def _clip_of(
@@ -374,7 +398,7 @@ def _clip_of(
     return QueuedClip(
         stamp_ns=local.stamp_ns,
         frame_stamps_ns=stamps_ns,
-        crop_xyxy=union_box(*boxes, local.width, local.height),
+        regions_xyxy=(union_box(*boxes, local.width, local.height),) * len(stamps_ns),
         vocabulary=local.vocabulary,
         rows=(i, j),
         classes=(int(classes[0]), int(classes[1])),

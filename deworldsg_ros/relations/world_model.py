@@ -52,8 +52,8 @@ class ClipRequest:
 class WorldModel(Protocol):
     """A frozen video model with its probe: maps a clip to predicate distributions.
 
-    A world model whose attribute `window` is ``valid_interval`` gets clips of the frames since both
-    objects were seen without a break.
+    Its attributes `window` and `crop`, if it has them, choose the frames and the region of its
+    clips, see `ProbeCard`.
     """
 
     @property

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import logging
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any, NamedTuple, Optional, Union
 
 import cv2
 import msgspec
 import numpy as np
 
 from deworldsg_ros.base.files import confined, parse_json
-from deworldsg_ros.checkpoints.cards import Window, relative_box_pair
+from deworldsg_ros.checkpoints.cards import Crop, Window, relative_box_pair
+from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.recordings.folders.annotations import (
     LAYOUTS,
     SPLIT_FILES,
@@ -23,15 +25,24 @@ from deworldsg_ros.recordings.folders.annotations import (
 from deworldsg_ros.recordings.folders.dataset import (
     DatasetOptions,
     decode_image,
-    image_size,
     read_file,
 )
 from deworldsg_ros.recordings.folders.frame_files import read_pose
-from deworldsg_ros.recordings.folders.sequence import RioScan, sequence_folder
-from deworldsg_ros.relations.clips import CropBox, Rgb, crop_clip, interval_start, union_box
+from deworldsg_ros.recordings.folders.sequence import ReplicaScan, RioScan, SequenceDataset
+from deworldsg_ros.relations.clips import (
+    BoxPair,
+    CropBox,
+    Rgb,
+    clip_regions,
+    crop_clip,
+    interval_start,
+)
+from deworldsg_ros.relations.paper import geometric_costs
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError, RecordingError, RefusedInput
+
+logger = logging.getLogger(__name__)
 
 # --- Clips of pairs with their predicates, from a folder.
 #
@@ -52,26 +63,28 @@ class LabelledClip:
     """A clip of an ordered pair; `read` loads its pixels.
 
     Attributes:
-        key: unique name, which changes with the content.
-        group: room or scan; never split between training and test.
+        key: name, which changes with the content; the same of clips with the same frames.
+        group: room; never split between training and test.
         pair: pair of objects in a group; never split between training and validation.
-        predicate: of subject to object.
+        predicates: of subject to object, each once; a pair may have several.
         boxes: (8,) float32, corners of subject and object as fractions of the clip's width and
             height; None = unknown.
         read: loads the frames, (T, h, w, 3) uint8 RGB, oldest first.
+        scan: of a data set; one room may have several.
     """
 
     key: str
     group: str
     pair: str
-    predicate: str
+    predicates: tuple[str, ...]
     boxes: Optional[Float32]
     read: Callable[[], Rgb]
+    scan: str = ""
 
 
 class _Line(msgspec.Struct, forbid_unknown_fields=True):
     clip: str
-    predicate: str
+    predicate: Union[str, Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]]
     group: str
     pair: str = ""
     subject_box: Optional[Box] = None
@@ -175,6 +188,7 @@ def _read_index(index: Path) -> list[LabelledClip]:
 def _clip(folder: Path, line: _Line) -> LabelledClip:
     path = folder / line.clip
     status = path.stat()
+    names = (line.predicate,) if isinstance(line.predicate, str) else line.predicate
     boxes = None
     if line.subject_box is not None and line.object_box is not None:
         boxes = np.array([*line.subject_box, *line.object_box], np.float32)
@@ -182,7 +196,7 @@ def _clip(folder: Path, line: _Line) -> LabelledClip:
         key=f"{line.clip} {status.st_size} {status.st_mtime_ns}",
         group=line.group,
         pair=f"{line.group} {line.pair or line.clip}",
-        predicate=line.predicate,
+        predicates=tuple(dict.fromkeys(names)),
         boxes=boxes,
         read=lambda: read_frames(path),
     )
@@ -190,63 +204,129 @@ def _clip(folder: Path, line: _Line) -> LabelledClip:
 
 # --- Clips of annotated pairs, cropped from the frames of a scan in the same way as at run time.
 
-# Boxes of the objects in a frame by object id, (4,) float64 xyxy pixels.
-Boxes = Mapping[int, Float64]
-# Image file of a frame, and its boxes; None = not known.
-ScanFrame = tuple[Path, Boxes | None]
+
+class Seen(NamedTuple):
+    """A visible object: its box, (4,) float64 xyxy pixels, and its mean depth, metres."""
+
+    box_xyxy: Float64
+    depth_m: float
+
+
+# Image file of a frame, and its visible objects by id; None = not known.
+ScanFrame = tuple[Path, Mapping[int, Seen] | None]
+
+
+@dataclass(frozen=True)
+class ClipChoice:
+    """Which clips of a data set.
+
+    Attributes:
+        clip_length: T, frames of a clip.
+        clips_per_pair: maximum number of clips per ordered pair.
+        split: ``train``, ``validation`` or ``test``.
+        window, crop: frames of a clip and region of them, see `ProbeCard`.
+        geo_cost_threshold: of Eq. 8 in the last frame, as at run time.
+    """
+
+    clip_length: int
+    clips_per_pair: int
+    split: str = "train"
+    window: Window = "last_frames"
+    crop: Crop = "last_frame"
+    geo_cost_threshold: float = RelationsConfig().geo_cost_threshold
+
+
+@dataclass(frozen=True)
+class Scan:
+    """The frames of an annotated scan.
+
+    Attributes:
+        name: its id.
+        room: the group of its clips.
+        frames: in order of time.
+        image_size: width and height of all images.
+        rotated: whether boxes and sizes are those of the images rotated by 90 degrees clockwise.
+    """
+
+    name: str
+    room: str
+    frames: Sequence[ScanFrame]
+    image_size: tuple[int, int]
+    rotated: bool = False
 
 
 def cut_clips(
-    scan: str,
-    frames: Sequence[ScanFrame],
-    image_size: tuple[int, int],
-    relations: Sequence[tuple[int, int, str]],
-    *,
-    clip_length: int,
-    clips_per_pair: int,
-    window: Window = "last_frames",
-    rotated: bool = False,
+    scan: Scan, relations: Sequence[tuple[int, int, str]], choice: ClipChoice
 ) -> list[LabelledClip]:
-    """Clips of each related pair, spread evenly over the frames in which both are visible.
+    """Clips of each related pair, spread evenly over the frames in which it satisfies Eq. 8.
 
     Args:
-        scan: id of the scan, the group of its clips.
-        frames: in order of time.
-        image_size: width and height of all images.
-        relations: subject id, object id, predicate.
-        clip_length: T.
-        clips_per_pair: maximum number of clips per pair.
-        window: frames of a clip, see `ProbeCard`.
-        rotated: whether boxes and sizes are those of the images rotated by 90 degrees clockwise.
+        scan: its frames.
+        relations: subject id, object id, predicate; one clip has all predicates of its pair.
+        choice: of the clips.
     """
-    width, height = image_size
-    clips = []
+    predicates: dict[tuple[int, int], dict[str, None]] = {}
     for subject, object_, predicate in relations:
-        seen = [_shows(boxes, subject, object_) for _, boxes in frames]
-        visible = [index for index, shown in enumerate(seen) if shown]
-        for index in _spread(visible, clips_per_pair):
-            boxes = frames[index][1] or {}
-            crop = union_box(boxes[subject], boxes[object_], width, height)
-            x1, y1, x2, y2 = crop
-            corner = np.array([x1, y1, x1, y1], np.float64)
-            first = max(0, index - clip_length + 1)
-            if window == "valid_interval":
-                first += interval_start(seen[first : index + 1])
-            paths = [path for path, _ in frames[first : index + 1]]
-            modified = paths[-1].stat().st_mtime_ns
-            clips.append(
-                LabelledClip(
-                    key=f"{scan} {paths[0].name} {paths[-1].name} {modified} {crop} {clip_length}",
-                    group=scan,
-                    pair=f"{scan} {min(subject, object_)} {max(subject, object_)}",
-                    predicate=predicate,
-                    boxes=relative_box_pair(
-                        boxes[subject] - corner, boxes[object_] - corner, x2 - x1, y2 - y1
-                    ),
-                    read=_reader(paths, crop, clip_length, rotated),
-                )
-            )
+        predicates.setdefault((subject, object_), {})[predicate] = None
+    clips = []
+    for pair, names in predicates.items():
+        shown = [_boxes_of(seen, pair) for _, seen in scan.frames]
+        near = [
+            index
+            for index, (_, seen) in enumerate(scan.frames)
+            if _both(shown[index]) and _geo_cost(seen, pair, scan) < choice.geo_cost_threshold
+        ]
+        clips += [
+            _clip_at(scan, pair, tuple(names), shown[: index + 1], choice)
+            for index in _spread(near, choice.clips_per_pair)
+        ]
     return clips
+
+
+def _clip_at(
+    scan: Scan,
+    pair: tuple[int, int],
+    predicates: tuple[str, ...],
+    shown: Sequence[BoxPair],
+    choice: ClipChoice,
+) -> LabelledClip:
+    """The clip of a pair that ends with the last frame of `shown`, its boxes."""
+    last = len(shown) - 1
+    first = max(0, last - choice.clip_length + 1)
+    if choice.window == "valid_interval":
+        both = [
+            None if scan.frames[index][1] is None else _both(shown[index])
+            for index in range(first, last + 1)
+        ]
+        first += interval_start(both)
+    paths = [path for path, _ in scan.frames[first : last + 1]]
+    regions = clip_regions(shown[first:], choice.crop, *scan.image_size)
+    x1, y1, x2, y2 = regions[-1]
+    corner = np.array([x1, y1, x1, y1], np.float64)
+    subject_box, object_box = (box - corner for box in shown[last] if box is not None)
+    modified = paths[-1].stat().st_mtime_ns
+    frames = f"{scan.name} {paths[0].name} {paths[-1].name} {modified}"
+    return LabelledClip(
+        key=f"{frames} {sorted(set(regions))} {choice.crop} {choice.clip_length}",
+        group=scan.room,
+        pair=f"{scan.room} {min(pair)} {max(pair)}",
+        predicates=predicates,
+        boxes=relative_box_pair(subject_box, object_box, x2 - x1, y2 - y1),
+        read=_reader(paths, regions, choice.clip_length, scan.rotated),
+        scan=scan.name,
+    )
+
+
+def _both(boxes: BoxPair) -> bool:
+    return all(box is not None for box in boxes)
+
+
+def _geo_cost(seen: Mapping[int, Seen] | None, pair: tuple[int, int], scan: Scan) -> float:
+    """The geometric cost of a visible pair (Eq. 8)."""
+    objects = [(seen or {})[end] for end in pair]
+    boxes = np.stack([item.box_xyxy for item in objects])
+    depths_m = np.array([item.depth_m for item in objects])
+    return float(geometric_costs(boxes, depths_m, *scan.image_size)[0, 1])
 
 
 def read_boxes(path: Path) -> dict[int, Float64]:
@@ -272,16 +352,14 @@ def read_boxes(path: Path) -> dict[int, Float64]:
     return boxes
 
 
-def _shows(boxes: Boxes | None, subject: int, object_: int) -> bool | None:
-    """Whether a frame shows both objects; None = not known."""
-    if boxes is None:
-        return None
-    return _is_visible(boxes.get(subject)) and _is_visible(boxes.get(object_))
-
-
-def _is_visible(box_xyxy: Float64 | None) -> bool:
-    """Whether an object has a box of at least 10 pixels a side."""
-    return box_xyxy is not None and bool((box_xyxy[2:] - box_xyxy[:2]).min() >= 10.0)
+def _boxes_of(seen: Mapping[int, Seen] | None, pair: tuple[int, int]) -> BoxPair:
+    """The boxes of a pair in a frame; None = not known, or less than 10 pixels wide or high."""
+    objects = [(seen or {}).get(end) for end in pair]
+    a, b = (
+        item.box_xyxy if item and (item.box_xyxy[2:] - item.box_xyxy[:2]).min() >= 10.0 else None
+        for item in objects
+    )
+    return a, b
 
 
 def _spread(indices: list[int], count: int) -> list[int]:
@@ -293,7 +371,7 @@ def _spread(indices: list[int], count: int) -> list[int]:
 
 
 def _reader(
-    paths: Sequence[Path], crop: CropBox, clip_length: int, rotated: bool
+    paths: Sequence[Path], regions: Sequence[CropBox], clip_length: int, rotated: bool
 ) -> Callable[[], Rgb]:
     def read() -> Rgb:
         images = []
@@ -305,36 +383,20 @@ def _reader(
             if rotated:
                 image = cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)
             images.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8))
-        return crop_clip(images, crop, clip_length)
+        return crop_clip(images, regions, clip_length)
 
     return read
 
 
 # --- Training clips of a probe, from a folder or from an annotated data set.
 
-# 3RScan has no boxes. They are computed from the annotated surface points in every 8th frame, ...
+# Depths, and in 3RScan boxes, are computed from the annotated surface points. In 3RScan in every
+# 8th frame, if the region of a clip is that of its last frame, ...
 BOXES_EVERY_FRAMES = 8
 # ... from points whose depth is within 5 cm of the depth image (others are hidden), ...
 MAX_DEPTH_GAP_M = 0.05
 # ... for objects with at least 20 such points.
 MIN_POINTS = 20
-
-
-@dataclass(frozen=True)
-class ClipChoice:
-    """Which clips of a data set.
-
-    Attributes:
-        clip_length: T, frames of a clip.
-        clips_per_pair: maximum number of clips per pair.
-        split: ``train``, ``validation`` or ``test``.
-        window: frames of a clip, see `ProbeCard`.
-    """
-
-    clip_length: int
-    clips_per_pair: int
-    split: str = "train"
-    window: Window = "last_frames"
 
 
 def read_clips(source: Path, choice: ClipChoice) -> list[LabelledClip]:
@@ -349,33 +411,19 @@ def read_clips(source: Path, choice: ClipChoice) -> list[LabelledClip]:
     annotations = Annotations(source, found[0])
     names = annotations.vocabulary.predicates
     clips: list[LabelledClip] = []
-    for scan in _scans(annotations, choice.split):
-        folder = annotations.scan_folder(scan)
-        rotated = found[0] == "3rscan"
-        frames = list(_rio_frames(annotations, scan) if rotated else _replica_frames(folder))
-        if not frames:
-            continue
-        width, height = image_size(frames[0][0])
-        clips += cut_clips(
-            scan,
-            frames,
-            (height, width) if rotated else (width, height),
-            [
-                (subject, object_, names[index])
-                for subject, object_, index in annotations.scan(scan).relations
-                if index >= 0
-            ],
-            clip_length=choice.clip_length,
-            clips_per_pair=choice.clips_per_pair,
-            window=choice.window,
-            rotated=rotated,
-        )
+    for name in _scans(annotations, choice.split):
+        relations = [
+            (subject, object_, names[index])
+            for subject, object_, index in annotations.scan(name).relations
+            if index >= 0
+        ]
+        clips += cut_clips(_read_scan(annotations, name, choice), relations, choice)
     if not clips:
         raise ConfigurationError(
-            f"data set '{source}': no frame of the split '{choice.split}' shows a related pair; "
-            "expected "
-            "data/SCAN/sequence/frame-NNNNNN.color.jpg with .bb.txt (ReplicaSSG) or with depth and "
-            "pose (3RScan)"
+            f"data set '{source}': no frame of the split '{choice.split}' shows a related pair "
+            f"with a geometric cost below {choice.geo_cost_threshold} (Eq. 8); expected "
+            "data/SCAN/sequence/frame-NNNNNN.color.jpg with .depth.pgm and .pose.txt, in "
+            "ReplicaSSG also .bb.txt"
         )
     return clips
 
@@ -409,6 +457,20 @@ def _scans(annotations: Annotations, split: str) -> list[str]:
             f"{len(tested)} scans of the split '{split}' of data set '{annotations.root}' are test "
             f"scans, too, first '{min(tested)}': give --split test to train on them nevertheless"
         )
+    rooms = {annotations.room(scan) for scan in scans}
+    shared = set()
+    for scan in _listed(annotations, "test"):
+        with contextlib.suppress(RecordingError):  # a scan that is in no list of rooms
+            shared |= rooms & {annotations.room(scan)}
+    if shared and split != "test":
+        logger.warning(
+            "%d rooms of the split '%s' of data set '%s' have test scans, too, first '%s': the "
+            "accuracy on those scans says nothing about other rooms",
+            len(shared),
+            split,
+            annotations.root,
+            min(shared),
+        )
     return scans
 
 
@@ -418,55 +480,55 @@ def _listed(annotations: Annotations, split: str) -> list[str]:
     return []
 
 
-def _replica_frames(folder: Path) -> Iterator[ScanFrame]:
-    for image in sorted(sequence_folder(folder).glob("frame-*.color.jpg")):
-        yield image, read_boxes(image.with_name(image.name.split(".")[0] + ".bb.txt"))
-
-
-def _rio_frames(annotations: Annotations, scan: str) -> Iterator[ScanFrame]:
-    """Each image, with boxes in the upright (rotated) image in every 8th frame."""
-    source = RioScan(annotations.scan_folder(scan), DatasetOptions())
-    points = annotations.points(scan)
-    height = source.info.color.height
+def _read_scan(annotations: Annotations, name: str, choice: ClipChoice) -> Scan:
+    """A scan, its boxes in pixels of the upright (in 3RScan rotated) image."""
+    rotated = annotations.layout.name == "3rscan"
+    folder = annotations.scan_folder(name)
+    source = (RioScan if rotated else ReplicaScan)(folder, DatasetOptions())
+    points = annotations.points(name)
+    every = BOXES_EVERY_FRAMES if rotated and choice.crop == "last_frame" else 1
+    frames: list[ScanFrame] = []
     for index, number in enumerate(source.frame_numbers.values()):
-        path = source.file(number, ".color.jpg")
-        if index % BOXES_EVERY_FRAMES:
-            yield path, None
-            continue
-        boxes: Boxes = {}
-        # A frame with missing or damaged files has no boxes.
+        seen: Mapping[int, Seen] | None = None if index % every else {}
+        # A frame with missing or damaged files shows nothing.
         with contextlib.suppress(RecordingError, RefusedInput):
-            boxes = _boxes_of_frame(source, number, points)
-        # Rotated by 90 degrees clockwise, like the images of RioScan.
-        yield (
-            path,
-            {
-                object_id: np.array([height - 1 - y2, x1, height - 1 - y1, x2])
-                for object_id, (x1, y1, x2, y2) in boxes.items()
-            },
-        )
+            if seen is not None:
+                seen = _seen_in_frame(source, number, points)
+        if not rotated:
+            own, seen = read_boxes(source.file(number, ".bb.txt")), seen or {}
+            seen = {end: Seen(own[end], seen[end].depth_m) for end in own.keys() & seen.keys()}
+        frames.append((source.file(number, ".color.jpg"), seen))
+    camera = source.intrinsics
+    return Scan(name, annotations.room(name), frames, (camera.width, camera.height), rotated)
 
 
-def _boxes_of_frame(source: RioScan, number: int, points: ScanPoints) -> Boxes:
+def _seen_in_frame(source: SequenceDataset, number: int, points: ScanPoints) -> Mapping[int, Seen]:
     path = source.file(number, source.depth_suffix)
     depth = decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path)
     T_world_camera = read_pose(source.file(number, source.pose_suffix))
     color = source.info.color
     same = depth.shape == (color.height, color.width)
     camera = color if same else source.info.depth
-    return visible_boxes(
-        points, T_world_camera, depth / source.info.depth_units_per_m, camera, color
-    )
+    depth_m = depth / source.info.depth_units_per_m
+    seen = visible_objects(points, T_world_camera, depth_m, camera, color)
+    if not source.rotated:
+        return seen
+    # Rotated by 90 degrees clockwise, like the images.
+    last = color.height - 1
+    rotated: dict[int, Seen] = {}
+    for end, ((x1, y1, x2, y2), depth_of_m) in seen.items():
+        rotated[end] = Seen(np.array([last - y2, x1, last - y1, x2]), depth_of_m)
+    return rotated
 
 
-def visible_boxes(
+def visible_objects(
     points: ScanPoints,
     T_world_camera: Float64,
     depth_m: Float64,
     depth_camera: Intrinsics,
     color_camera: Intrinsics,
-) -> Mapping[int, Float64]:
-    """Boxes (4,) xyxy of the visible annotated objects, pixels of the colour image.
+) -> Mapping[int, Seen]:
+    """The visible annotated objects by id: boxes in pixels of the colour image, and mean depths.
 
     Args:
         points: annotated surface points, world frame.
@@ -488,9 +550,11 @@ def visible_boxes(
     u, v = color_camera.project(points_in_front).T
     visible &= (u >= 0) & (u <= color_camera.width - 1)
     visible &= (v >= 0) & (v <= color_camera.height - 1)
-    boxes: dict[int, Float64] = {}
-    for object_id in np.unique(ids[visible]).tolist():
-        own = visible & (ids == object_id)
+    u, v, z, ids = u[visible], v[visible], z[visible], ids[visible]
+    seen: dict[int, Seen] = {}
+    for object_id in np.unique(ids).tolist():
+        own = ids == object_id
         if np.count_nonzero(own) >= MIN_POINTS:
-            boxes[object_id] = np.array([u[own].min(), v[own].min(), u[own].max(), v[own].max()])
-    return boxes
+            box = np.array([u[own].min(), v[own].min(), u[own].max(), v[own].max()])
+            seen[object_id] = Seen(box, float(z[own].mean()))
+    return seen

@@ -33,12 +33,15 @@ from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.training.clips import LabelledClip, of_length
 from deworldsg_ros.training.options import ClipOrigin, FitOptions, TrainingOptions
 
-# --- Fit of a probe on features: weighted cross-entropy, early stopping, one random seed.
+# --- Fit of a probe on features: cross-entropy, early stopping, one random seed.
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A trained probe, the losses of each epoch, and the epoch of the kept weights."""
+    """A trained probe, the losses of each epoch, and the epoch of the kept weights.
+
+    Without validation clips there are no validation losses, and the last epoch is kept.
+    """
 
     probe: Probe
     train_losses: list[float]
@@ -46,49 +49,54 @@ class Fit:
     best_epoch: int
 
 
-def class_weights(labels: Int64, count: int) -> Float32:
-    """Weight of each predicate in the loss, (count,) float32, inverse to its frequency.
+def class_weights(targets: Float32) -> Float32:
+    """Weight of each predicate in the loss, (R,) float32, inverse to its frequency.
 
     The mean weight of a clip is one. Predicates without a clip have weight zero.
+
+    Args:
+        targets: (n, R) float32, distributions of the clips.
     """
-    occurrences = np.bincount(labels, minlength=count)
+    occurrences = targets.sum(axis=0)
     present = occurrences > 0
-    weights = np.zeros(count, np.float32)
-    weights[present] = len(labels) / (present.sum() * occurrences[present])
+    weights = np.zeros_like(occurrences)
+    weights[present] = len(targets) / (present.sum() * occurrences[present])
     return weights
 
 
 def fit_probe(
     card: ProbeCard,
     inputs: Float32,
-    labels: Int64,
+    targets: Float32,
     train: Int64,
     validation: Int64,
     options: FitOptions,
-    advance: Callable[[float, float], None] = lambda *_: None,
+    advance: Callable[[float, float | None], None] = lambda *_: None,
 ) -> Fit:
     """Train a probe.
 
     Args:
         card: architecture of the probe.
         inputs: (n, input_dim) float32.
-        labels: (n,) int64, indices of the card's predicates.
+        targets: (n, R) float32, distributions over the card's predicates.
         train: rows to train on.
-        validation: rows whose loss stops the fit.
+        validation: rows whose loss stops the fit; without any it has `options.epochs` epochs.
         options: of the fit.
-        advance: called with the training and the validation loss after each epoch.
+        advance: called with the training and the validation loss (None = no rows) after each epoch.
     """
     torch.manual_seed(options.seed)
     # Features of different dimensions differ by orders of magnitude. The network is trained on
     # standardised inputs; the standardisation is then folded into its first layer.
     mean, std = inputs[train].mean(axis=0), inputs[train].std(axis=0) + 1e-6
-    weights = torch.from_numpy(class_weights(labels[train], len(card.predicates)))
-    values, targets = torch.from_numpy((inputs - mean) / std), torch.from_numpy(labels)
+    weighted = options.class_weights == "inverse_frequency"
+    weights = torch.from_numpy(class_weights(targets[train])) if weighted else None
+    values = torch.from_numpy((inputs - mean) / std)
     network = build_network(card)
-    optimisation = _Optimisation(network, values, targets, weights, options)
-    rows, judged = torch.from_numpy(train), torch.from_numpy(validation)
+    optimisation = _Optimisation(network, values, torch.from_numpy(targets), weights, options)
     # A predicate without training clips cannot be learnt: its validation clips do not count.
-    judged = judged[weights[targets[judged]] > 0]
+    unknown = targets[train].sum(axis=0) == 0
+    known = ~targets[validation][:, unknown].any(axis=1)
+    rows, judged = torch.from_numpy(train), torch.from_numpy(validation[known])
     train_losses: list[float] = []
     validation_losses: list[float] = []
     best = copy.deepcopy(network.state_dict())
@@ -97,7 +105,10 @@ def fit_probe(
         # Batch normalisation has no deviation over a batch of one.
         least_batch = 2 if card.layout == "batch_norm" else 1
         train_losses.append(optimisation.train_epoch(rows, least_batch))
-        loss = optimisation.loss(judged) if len(judged) else train_losses[-1]
+        if not len(judged):
+            advance(train_losses[-1], None)
+            continue
+        loss = optimisation.loss(judged)
         validation_losses.append(loss)
         advance(train_losses[-1], loss)
         if loss < lowest:
@@ -105,21 +116,24 @@ def fit_probe(
             best = copy.deepcopy(network.state_dict())
         elif epoch - best_epoch >= options.patience:
             break
-    network.load_state_dict(best)
+    if len(judged):
+        network.load_state_dict(best)
+    else:
+        best_epoch = options.epochs - 1
     _fold_standardisation(network, card, mean, std)
     probe = Probe(card, network.eval().requires_grad_(False))
     return Fit(probe, train_losses, validation_losses, best_epoch)
 
 
 class _Optimisation:
-    """A network with its data, its weighted cross-entropy and AdamW."""
+    """A network with its data, its cross-entropy and AdamW."""
 
     def __init__(
         self,
         network: torch.nn.Sequential,
         values: torch.Tensor,
         targets: torch.Tensor,
-        weights: torch.Tensor,
+        weights: torch.Tensor | None,
         options: FitOptions,
     ) -> None:
         self._network = network
@@ -183,11 +197,13 @@ class Scores:
 
     Attributes:
         clips: number of clips.
-        micro_accuracy: fraction of correct clips.
+        micro_accuracy: fraction of correct clips: the most probable predicate is one of theirs.
         macro_accuracy: mean over the predicates that occur of their fraction of correct clips.
         chance_macro: macro accuracy of guessing among the predicates of the training clips.
         majority_micro: micro accuracy of always predicting the most frequent training predicate.
-        confusion: (R, R) int64, counts by true and predicted predicate.
+        log_loss_nats: mean cross-entropy of their distributions; it judges the probabilities.
+        confusion: (R, R) int64, counts by true and predicted predicate. Of the predicates of a
+            clip, the true one is the predicted one if it is among them, else the first.
     """
 
     clips: int
@@ -195,24 +211,28 @@ class Scores:
     macro_accuracy: float
     chance_macro: float
     majority_micro: float
+    log_loss_nats: float
     confusion: Int64
 
 
-def score(distributions: Float64, labels: Int64, train_labels: Int64) -> Scores:
-    """Compare predicted distributions (n, R) with labels (n,)."""
+def score(distributions: Float64, targets: Float32, train_targets: Float32) -> Scores:
+    """Compare predicted distributions (n, R) with those of the clips, (n, R) each, n > 0."""
     count = distributions.shape[1]
+    predicted = distributions.argmax(axis=1)
+    right = targets[np.arange(len(targets)), predicted] > 0
     confusion = np.zeros((count, count), np.int64)
-    np.add.at(confusion, (labels, distributions.argmax(axis=1)), 1)
+    np.add.at(confusion, (np.where(right, predicted, targets.argmax(axis=1)), predicted), 1)
     totals = confusion.sum(axis=1)
     present = totals > 0
-    fractions = confusion.diagonal()[present] / totals[present]
-    majority = int(np.bincount(train_labels, minlength=count).argmax()) if len(train_labels) else 0
+    logs = np.log(np.maximum(distributions, np.finfo(np.float64).tiny))
+    occurrences = train_targets.sum(axis=0)
     return Scores(
-        clips=len(labels),
-        micro_accuracy=float(confusion.trace() / max(len(labels), 1)),
-        macro_accuracy=float(fractions.mean()) if present.any() else 0.0,
-        chance_macro=1 / max(len(np.unique(train_labels)), 1),
-        majority_micro=float(totals[majority] / max(len(labels), 1)),
+        clips=len(targets),
+        micro_accuracy=float(right.mean()),
+        macro_accuracy=float((confusion.diagonal()[present] / totals[present]).mean()),
+        chance_macro=1 / int(np.count_nonzero(occurrences)),
+        majority_micro=float((targets[:, occurrences.argmax()] > 0).mean()),
+        log_loss_nats=float(-(targets * logs).sum(axis=1).mean()),
         confusion=confusion,
     )
 
@@ -294,7 +314,8 @@ def extract_features(
         batch_size: clips encoded at once.
         advance: called with the number of further clips that are done.
     """
-    missing = [clip for clip in clips if cache.get(clip.key) is None]
+    # Both directions of a pair have the same clip.
+    missing = list({clip.key: clip for clip in clips if cache.get(clip.key) is None}.values())
     advance(len(clips) - len(missing))
     try:
         for start in range(0, len(missing), batch_size):
@@ -324,7 +345,8 @@ class Split:
     Attributes:
         train, validation, held_out: (n,) int64 rows.
         held_out_groups: names of the held-out rooms.
-        validation_by: ``group``, or ``pair`` if only one room is left to train on.
+        validation_by: ``group``, or ``pair`` if only one room is left to train on; ``none`` if
+            nothing is held out.
     """
 
     train: Int64
@@ -334,8 +356,9 @@ class Split:
     validation_by: str
 
     def parts(self) -> dict[str, Int64]:
-        """The rows of each part by its name."""
-        return {"train": self.train, "validation": self.validation, "held_out": self.held_out}
+        """The rows of each part that has some, by its name."""
+        parts = {"train": self.train, "validation": self.validation, "held_out": self.held_out}
+        return {name: rows for name, rows in parts.items() if len(rows)}
 
 
 def split_by_group(
@@ -351,7 +374,7 @@ def split_by_group(
     Args:
         groups: group of each clip, e.g. its room.
         pairs: pair of objects of each clip.
-        held_out_fraction: fraction of the groups to hold out, at least one group.
+        held_out_fraction: fraction of the groups to hold out, at least one group; 0 trains on all.
         held_out_groups: hold out exactly these groups instead.
         seed: of the random choice.
 
@@ -365,10 +388,13 @@ def split_by_group(
             f"held-out groups {', '.join(unknown)} have no clips: "
             f"expected some of {', '.join(names)}"
         )
+    if not held_out_groups and not held_out_fraction:
+        none = np.zeros(0, np.int64)
+        return Split(np.arange(len(groups), dtype=np.int64), none, none, (), "none")
     if len(names) < 2 or len(set(held_out_groups)) == len(names):
         raise ConfigurationError(
             f"the clips have {len(names)} group(s), {len(set(held_out_groups))} of them held out: "
-            "expected at least one to train on and one to hold out"
+            "expected at least one to train on and one to hold out, or a held-out fraction of 0"
         )
     generator = np.random.default_rng(seed)
     chosen = set(held_out_groups) or _choose(generator, names, held_out_fraction)
@@ -448,11 +474,11 @@ class Progress:
 
     Attributes:
         encoded: called with the number of further clips that have features.
-        epoch: called with the training and the validation loss of an epoch.
+        epoch: called with the training and the validation loss of an epoch; None = no validation.
     """
 
     encoded: Callable[[int], None] = lambda _: None
-    epoch: Callable[[float, float], None] = lambda *_: None
+    epoch: Callable[[float, float | None], None] = lambda *_: None
 
 
 def train_probe(
@@ -470,7 +496,7 @@ def train_probe(
 
     Args:
         backbone: encodes the clips.
-        clips: labelled clips of at least two groups.
+        clips: labelled clips; of at least two groups if one is held out.
         predicates: names of the probe's outputs.
         out: folder of the probe.
         options: of the training.
@@ -486,7 +512,7 @@ def train_probe(
     """
     progress = progress or Progress()
     card = _card(backbone, predicates, options)
-    labels = _labels(clips, predicates)
+    targets = _targets(clips, predicates)
     boxes = _boxes(clips, options)
     split = _split(clips, options)
     features = extract_features(
@@ -498,10 +524,10 @@ def train_probe(
     )
     inputs = probe_inputs(card, features, boxes)
     fit = fit_probe(
-        card, inputs, labels, split.train, split.validation, options.fit, progress.epoch
+        card, inputs, targets, split.train, split.validation, options.fit, progress.epoch
     )
     scores = {
-        name: score(fit.probe.distributions(inputs[rows]), labels[rows], labels[split.train])
+        name: score(fit.probe.distributions(inputs[rows]), targets[rows], targets[split.train])
         for name, rows in split.parts().items()
     }
     record = asdict(origin or ClipOrigin()) | _record(clips, split, backbone, options)
@@ -512,7 +538,12 @@ def _card(
     backbone: FrozenBackbone, predicates: tuple[str, ...], options: TrainingOptions
 ) -> ProbeCard:
     return ProbeCard(
-        backbone.identity, predicates, options.layout, options.inputs, window=options.window
+        backbone.identity,
+        predicates,
+        options.layout,
+        options.inputs,
+        window=options.window,
+        crop=options.crop,
     )
 
 
@@ -522,12 +553,14 @@ def _record(
     """How a probe was trained, for its card."""
     parts = split.parts()
     groups = {name: sorted({clips[row].group for row in rows}) for name, rows in parts.items()}
+    scans = {name: sorted({clips[row].scan for row in rows} - {""}) for name, rows in parts.items()}
     return {
         "options": msgspec.to_builtins(asdict(options)),
         "preprocessing": backbone.description,
         "torch": str(torch.__version__),
         "clips": {name: len(rows) for name, rows in parts.items()},
         "groups_by_part": groups,
+        "scans_by_part": scans,
         "held_out_groups": list(split.held_out_groups),
         "validation_by": split.validation_by,
     }
@@ -557,7 +590,8 @@ def _save(
     with together(out, (METRICS_FILE, CONFUSION_FILE, *PROBE_FILES)) as staged:
         content = msgspec.json.format(msgspec.json.encode(metrics), indent=1)
         write_atomically(staged / METRICS_FILE, content)
-        write_confusion(staged / CONFUSION_FILE, scores["held_out"].confusion, card.predicates)
+        judged = scores.get("held_out", scores["train"])
+        write_confusion(staged / CONFUSION_FILE, judged.confusion, card.predicates)
         write_probe(staged, Probe(card, fit.probe.network))
     return metrics
 
@@ -573,17 +607,20 @@ def _boxes(clips: Sequence[LabelledClip], options: TrainingOptions) -> Float32:
     return np.stack([none if clip.boxes is None else clip.boxes for clip in clips])
 
 
-def _labels(clips: Sequence[LabelledClip], predicates: tuple[str, ...]) -> Int64:
-    """(n,) index of each clip's predicate."""
+def _targets(clips: Sequence[LabelledClip], predicates: tuple[str, ...]) -> Float32:
+    """(n, R) distribution of each clip: its predicates have equal parts."""
     indices = {name: index for index, name in enumerate(predicates)}
-    unknown = Counter(clip.predicate for clip in clips if clip.predicate not in indices)
+    unknown = Counter(name for clip in clips for name in clip.predicates if name not in indices)
     if unknown:
         name, count = unknown.most_common(1)[0]
         raise ConfigurationError(
             f"{count} clips have the predicate '{name}', which is not one of the "
             f"{len(predicates)} of the chosen set: choose another set, or rename it"
         )
-    return np.array([indices[clip.predicate] for clip in clips], np.int64)
+    targets = np.zeros((len(clips), len(predicates)), np.float32)
+    for row, clip in enumerate(clips):
+        targets[row, [indices[name] for name in clip.predicates]] = 1 / len(clip.predicates)
+    return targets
 
 
 def _metrics(scores: Scores, predicates: tuple[str, ...]) -> dict[str, Any]:
@@ -595,6 +632,7 @@ def _metrics(scores: Scores, predicates: tuple[str, ...]) -> dict[str, Any]:
         "macro_accuracy": scores.macro_accuracy,
         "chance_macro": scores.chance_macro,
         "majority_micro": scores.majority_micro,
+        "log_loss_nats": scores.log_loss_nats,
         "by_predicate": {
             predicates[index]: {
                 "clips": int(totals[index]),

@@ -10,12 +10,14 @@ pytestmark = pytest.mark.models
 
 from support.checkpoints import save_vjepa2  # noqa: E402  after the guards
 from support.cli import invoke, printed, refusal  # noqa: E402
-from support.evaluation import write_dataset  # noqa: E402
+from support.evaluation import write_dataset, write_ply  # noqa: E402
 from support.pair_rooms import render_room  # noqa: E402
+from support.sequences import write_info, write_pgm  # noqa: E402
 
 from deworldsg_ros.checkpoints.cards import CheckpointCard, write_detector_card  # noqa: E402
 from deworldsg_ros.checkpoints.probe_network import load_probe  # noqa: E402
 from deworldsg_ros.cli.probe import read_predicates  # noqa: E402
+from deworldsg_ros.scene.camera import Intrinsics  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES  # noqa: E402
 
@@ -25,15 +27,23 @@ def write_data_set(root, scans=3, frames=6):
     content = ([("chair", 1), ("table", 2)], [(1, 2, "on"), (2, 1, "near")])
     names = [f"scan_{n}" for n in range(scans)]
     write_dataset(root, dict.fromkeys(names, content), split_scans=())
+    camera = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
     (root / "ReplicaSSG" / "train_scans.txt").write_text("\n".join(names))
     for seed, name in enumerate(names):
         sequence = root / "data" / name / "sequence"
-        sequence.mkdir()
+        write_info(sequence / "_info.txt", camera, camera)
         _, pair = render_room(seed, 2, frames)
+        # Surface points 2 m in front of the camera.
+        points, ids = np.zeros((40, 3)), np.repeat([1, 2], 20)
+        points[:, 0], points[:, 2] = np.linspace(-0.4, 0.4, 40), 2
+        write_ply(root / "data" / name / "labels.instances.annotated.v2.ply", points, ids)
         for number, frame in enumerate(pair.frames):
             cv2.imwrite(str(sequence / f"frame-{number:06}.color.jpg"), frame[..., ::-1])
             rows = [f"{i + 1} {' '.join(map(str, box))}" for i, box in enumerate(pair.boxes_xyxy)]
             (sequence / f"frame-{number:06}.bb.txt").write_text("\n".join(rows))
+            np.savetxt(sequence / f"frame-{number:06}.pose.txt", np.eye(4))
+            depth = np.full((120, 160), 2000, np.uint16)
+            write_pgm(sequence / f"frame-{number:06}.depth.pgm", depth)
     return root
 
 
@@ -57,6 +67,20 @@ def test_a_probe_from_a_data_set(tmp_path):
     assert card.training["data_split"] == "train" and card.window == "last_frames"
     assert card.training["groups_by_part"]["held_out"] == ["scan_1"]
     assert card.seen_groups == {"scan_0", "scan_2"}
+    assert card.training["scans_by_part"]["validation"] in (["scan_0"], ["scan_2"])
+
+
+def test_a_probe_of_all_rooms_has_a_fixed_number_of_epochs(tmp_path):
+    data = write_data_set(tmp_path / "data_set", scans=1)
+    words = ("train-probe", data, *options(tmp_path, **{"held-out-fraction": 0}))
+    extra = ("--crop", "each_frame", "--class-weights", "inverse_frequency")
+    assert "trained on all 8 clips for 3 epochs" in printed(*words, *extra)
+    card = load_probe(tmp_path / "probe").card
+    assert card.crop == "each_frame" and card.training["clips"] == {"train": 8}
+    epochs = words.index("--epochs")
+    assert "give --epochs" in refusal(*words[:epochs], *words[epochs + 2 :])
+    # Both objects are equally far away: only a cost of 0 refuses the pair.
+    assert "below 0.001 (Eq. 8)" in refusal(*words, "--geo-cost-threshold", 0.001)
 
 
 def test_scans_of_another_split_need_a_word(tmp_path):
@@ -76,6 +100,9 @@ def test_scans_of_another_split_need_a_word(tmp_path):
         ({"world-model": "fake"}, "vjepa2 or dinov2"),
         ({"layout": "three"}, "two_layer or batch_norm"),
         ({"window": "all"}, "last_frames or valid_interval"),
+        ({"crop": "all"}, "last_frame or clip_union or each_frame"),
+        ({"class-weights": "all"}, "none or inverse_frequency"),
+        ({"geo-cost-threshold": -1}, "relations.geo_cost_threshold"),
         ({"split": "all"}, "train or validation or test"),
         ({"predicates": "/absent"}, "replica_ssg, 3dssg, a file"),
         ({"predicates": "3dssg"}, "one of the 7"),

@@ -198,13 +198,25 @@ def test_a_failed_scan_is_reported_and_does_not_stop_the_rest(root, tmp_path):
 
 def test_a_scan_of_the_training_of_the_probe_is_told(tmp_path, caplog):
     parts = {"train": ["a"], "validation": ["b"], "held_out": ["c"]}
+    scans = {"train": ["a2"]}
     backbone = BackboneIdentity("vjepa2", 48, 32, 4)
-    write_probe_card(tmp_path, ProbeCard(backbone, ("on",), training={"groups_by_part": parts}))
+    record = {"groups_by_part": parts, "scans_by_part": scans}
+    write_probe_card(tmp_path, ProbeCard(backbone, ("on",), training=record))
     probed = RelationsConfig(world_model="vjepa2", probe_path=str(tmp_path))
-    for scan in "abcd":
-        warn_of_training(probed, scan)
-        warn_of_training(RelationsConfig(), scan)
-    assert [message.split()[:2] for message in caplog.messages] == [["scan", "a"], ["scan", "b"]]
+    annotations = Annotations(write_dataset(tmp_path / "set", {}, layout="3rscan"), "3rscan")
+
+    def told():
+        caplog.clear()
+        for scan in ("a", "a2", "a3", "b", "c", "d"):
+            warn_of_training(probed, annotations, scan)
+            warn_of_training(RelationsConfig(), annotations, scan)
+        return [message.split()[1] for message in caplog.messages]
+
+    assert told() == ["a", "a2", "b"]
+    # The list of rooms tells the other rescans, too.
+    rooms = [{"reference": "a", "scans": [{"reference": "a3"}]}]
+    (annotations.root / "3RScan.json").write_text(json.dumps(rooms))
+    assert told() == ["a", "a2", "a3", "b"]
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,6 +11,8 @@ from support.relations import (
     RecordingModel,
     config,
     crowd_graph,
+    empty_graph,
+    local_graph,
     pair_graph,
     picture,
 )
@@ -232,6 +235,36 @@ def test_a_clip_of_the_valid_interval_begins_after_the_last_gap(
     stage.drain()
     # The clip of the newest frame comes first.
     assert shown_stamps(model) == expected
+
+
+@pytest.mark.parametrize("waited", [False, True])
+@pytest.mark.parametrize(
+    ("crop", "left", "shape"),
+    [("last_frame", 10, (31, 41)), ("clip_union", 6, (31, 45)), ("each_frame", 10, (31, 41))],
+)
+def test_the_card_of_a_probe_chooses_the_region_of_its_clips(crop, left, shape, waited):
+    """The camera turns: objects move by 2 pixels a frame. Rows of the frames are swapped."""
+    model, graph = RecordingModel(), of_pair()
+    model.crop = crop
+    graph.nodes_of_frame = lambda stamp_ns: [[1, 2], [2, 1]][stamp_ns % 2]
+    graph.labels = {1: "table", 2: "cup"}
+    graph.tentative = {1} if waited else set()
+    stage = watching(graph, model)
+    for stamp in range(1, 14 if waited else 4):
+        boxes = np.array([[10, 20, 50, 40], [20, 10, 30, 22]]) - [2 * (3 - stamp), 0] * 2
+        order = [1, 0] if stamp % 2 else [0, 1]
+        shown = local_graph(stamp, boxes[order], [1.5, 1.5], np.array([1, 2])[order])
+        stage.observe(shown if stamp < 4 else empty_graph(stamp), picture(stamp))
+    graph.tentative = set()
+    assert stage.work() is not None
+    (request,) = model.requests[:1]
+    assert request.clip.shape == (4, *shape, 3)
+    corner = np.array([left, 10] * 2)
+    boxes = [request.pairs[0].subject_box_xyxy, request.pairs[0].object_box_xyxy]
+    assert {tuple(box + corner) for box in boxes} == {(10, 20, 50, 40), (20, 10, 30, 22)}
+    for row, stamp in enumerate((1, 2, 3, 3)):
+        x1 = left - 2 * (3 - stamp) * (crop == "each_frame")
+        assert (request.clip[row] == picture(stamp)[10:41, x1 : x1 + shape[1]]).all()
 
 
 def test_a_clip_that_waited_is_cut_to_its_valid_interval():

@@ -16,6 +16,7 @@ from deworldsg_ros.relations.clips import (
     PairKey,
     QueuedClip,
     Rank,
+    clip_regions,
     crop_clip,
     union_box,
 )
@@ -81,7 +82,7 @@ def test_union_box(a, b, expected):
 @pytest.mark.parametrize("count", [1, 3, 5])
 def test_a_clip_is_the_crop_of_each_frame_and_the_last_one_fills_it(count):
     images = [picture(stamp) for stamp in range(count)]
-    clip = crop_clip(images, (10, 5, 30, 25), 5)
+    clip = crop_clip(images, [(10, 5, 30, 25)] * count, 5)
     assert clip.shape == (5, 20, 20, 3) and clip.dtype == np.uint8
     for row in range(5):
         assert (clip[row] == images[min(row, count - 1)][5:25, 10:30]).all()
@@ -89,7 +90,23 @@ def test_a_clip_is_the_crop_of_each_frame_and_the_last_one_fills_it(count):
     assert (images[0] == picture(0)).all()  # it is a copy
     for wrong in (0, 6):
         with pytest.raises(ValueError, match=f"clip of {wrong} frames: expected 1 to 5"):
-            crop_clip([picture(0)] * wrong, (0, 0, 9, 9), 5)
+            crop_clip([picture(0)] * wrong, [(0, 0, 9, 9)] * wrong, 5)
+
+
+def test_a_clip_has_the_region_of_its_last_frame_of_all_or_each_its_own():
+    """The first object moves by 10 pixels a frame, the second is not seen in the middle frame."""
+    a = [np.array([10.0 * n, 0, 10 * n + 5, 5]) for n in range(3)]
+    b = [np.array([0.0, 8, 5, 12]), None, np.array([2.0, 20, 9, 30])]
+    pairs = list(zip(a, b))
+    own = ((0, 0, 6, 13), (2, 0, 16, 31), (2, 0, 26, 31))
+    assert clip_regions(pairs, "last_frame", WIDTH, HEIGHT) == own[-1:] * 3
+    assert clip_regions(pairs, "clip_union", WIDTH, HEIGHT) == ((0, 0, 26, 31),) * 3
+    assert clip_regions(pairs, "each_frame", WIDTH, HEIGHT) == own
+    clip = crop_clip([picture(n) for n in range(3)], own, 4)
+    assert clip.shape == (4, 31, 24, 3) and (clip[2:] == picture(2)[:31, 2:26]).all()
+    # A region is resized to that of the last frame.
+    flat = [np.full((HEIGHT, WIDTH, 3), 40 * n, np.uint8) for n in range(3)]
+    assert (crop_clip(flat, own, 3)[:, 0, 0, 0] == [0, 40, 80]).all()
 
 
 # --- the queue -----------------------------------------------------------------------------------
@@ -98,7 +115,7 @@ def test_a_clip_is_the_crop_of_each_frame_and_the_last_one_fills_it(count):
 def queued(stamp_ns, geo_cost=0.1, rows=(0, 1)):
     box = np.zeros(4)
     return QueuedClip(
-        stamp_ns, (stamp_ns,), (0, 0, 10, 10), VOCABULARY, rows, (0, 1), (box, box), geo_cost
+        stamp_ns, (stamp_ns,), ((0, 0, 10, 10),), VOCABULARY, rows, (0, 1), (box, box), geo_cost
     )
 
 

@@ -1,18 +1,23 @@
 """Training of probes: features on disk, split, fit, record, accuracy."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from support.checkpoints import config_of, save_vjepa2, torch
+from support.evaluation import PREDICATES as CHANCE
+from support.evaluation import write_dataset
 from support.pair_rooms import PREDICATES, render_room
+from support.sequences import BLOCKS, HEIGHT, WIDTH, write_sequence, write_surface
 
 from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard
 from deworldsg_ros.checkpoints.probe_network import load_probe
 from deworldsg_ros.relations import clip_models, union_box
+from deworldsg_ros.relations.clip_models import FrozenBackbone
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.training.clips import read_clip_folder
+from deworldsg_ros.training.clips import ClipChoice, read_clip_folder, read_clips
 from deworldsg_ros.training.options import FitOptions, TrainingOptions
 from deworldsg_ros.training.train import (
     FeatureCache,
@@ -71,7 +76,7 @@ def test_the_saved_probe_has_the_reported_accuracy(train, backbone, clips, tmp_p
     assert held_out["clips"] == len(held) == 2 * PAIRS
     features = backbone.encode([clip.read() for clip in held])
     answers = load_probe(tmp_path).predict(features, np.zeros((len(held), 8), np.float32))
-    labels = np.array([PREDICATES.index(clip.predicate) for clip in held])
+    labels = np.array([PREDICATES.index(*clip.predicates) for clip in held])
     right = int((answers.argmax(axis=1) == labels).sum())
     assert right == round(held_out["micro_accuracy"] * len(held))
 
@@ -88,6 +93,7 @@ def test_a_probe_is_better_than_chance_on_held_out_rooms_and_has_a_record(
     training = probe.card.training
     assert training["held_out_groups"] == ["room0", "room1"]
     assert probe.card.seen_groups == {f"room{n}" for n in range(2, ROOMS)}
+    assert probe.card.crop == "last_frame"
     assert training["options"]["fit"]["seed"] == 1 and training["validation_by"] == "group"
     saved = json.loads((tmp_path / "a" / "metrics.json").read_text())
     assert saved["held_out"] == held_out
@@ -158,22 +164,96 @@ def test_no_room_is_on_two_sides_and_clips_of_a_pair_stay_together():
     assert not {pairs[row] for row in split.train} & {pairs[row] for row in split.validation}
 
     for groups, held_out, reported in (
-        (["a"] * 4, (), "1 group"),
+        (["a"] * 4, (), "1 group.*or a held-out fraction of 0"),
         (["a", "b"], ("c",), "held-out groups c have no clips"),
         (["a", "b"], ("a", "b"), "2 of them held out"),
     ):
         with pytest.raises(ConfigurationError, match=reported):
             split_by_group(groups, groups, held_out_fraction=0.2, held_out_groups=held_out)
+    split = split_by_group(["a"] * 4, ["a"] * 4, held_out_fraction=0)
+    assert list(split.parts()) == ["train"] and len(split.train) == 4
+
+
+def room_colours(folder, seed=0):
+    """3RScan's layout: 12 rooms with three scans each, whose pictures and labels are random."""
+    generator = np.random.default_rng(seed)
+    objects = [(name, number) for number, name, _, _ in BLOCKS]
+    scans, rooms, pictures = {}, [], {}
+    for room in range(12):
+        names = [f"scan {room} {n}" for n in range(3)]
+        labels = [CHANCE[index] for index in generator.integers(0, len(CHANCE), 2)]
+        scans |= dict.fromkeys(names, (objects, [(1, 2, labels[0]), (3, 2, labels[1])]))
+        rooms.append({"reference": names[0], "scans": [{"reference": n} for n in names[1:]]})
+        picture = generator.integers(0, 256, (HEIGHT // 8, WIDTH // 8, 3), np.uint8)
+        pictures |= dict.fromkeys(names, cv2.resize(picture, (WIDTH, HEIGHT)))
+    root = write_dataset(folder, scans, layout="3rscan", split_scans=())
+    (root / "3DSSG_subset" / "train_scans.txt").write_text("\n".join(scans))
+    (root / "3RScan.json").write_text(json.dumps(rooms))
+    for name, picture in pictures.items():
+        write_surface(write_sequence(root / "data" / name, frames=1))
+        cv2.imwrite(str(root / "data" / name / "sequence/frame-000000.color.jpg"), picture)
+    return root
+
+
+def test_labels_without_signal_are_predicted_by_chance_in_held_out_rooms(tmp_path):
+    """A rescan of a room in the training would give its labels away."""
+
+    def pixels(videos):
+        return torch.nn.functional.adaptive_avg_pool2d(videos.mean(dim=1), 6).flatten(1)
+
+    identity = BackboneIdentity("vjepa2", 108, 24, 2, fit="stretch")
+    geometry = clip_models.ClipGeometry(24, "bilinear")
+    backbone = FrozenBackbone(identity, geometry, torch.device("cpu"), torch.float32, pixels)
+    clips = read_clips(room_colours(tmp_path / "set"), ClipChoice(2, 1))
+    assert len(clips) == 72 and len({clip.group for clip in clips}) == 12
+    options = TrainingOptions(held_out_fraction=0.4, batch_size=16)
+    accuracy = {}
+    for name, by in {"rooms": clips, "scans": [replace(c, group=c.scan) for c in clips]}.items():
+        metrics = train_probe(backbone, by, CHANCE, tmp_path / name, options)
+        accuracy[name] = metrics["held_out"]["micro_accuracy"]
+    assert accuracy["rooms"] < 0.5 and accuracy["scans"] > 0.7
 
 
 def fit(inputs, labels, rows, split, options):
     names = tuple(f"predicate {n}" for n in range(labels.max() + 1))
     card = ProbeCard(BackboneIdentity("vjepa2", inputs.shape[1], 32, 4), names)
-    return fit_probe(card, inputs, labels, rows[:split], rows[split:], options)
+    return fit_probe(card, inputs, one_hot(labels), rows[:split], rows[split:], options)
+
+
+def one_hot(labels, count=None):
+    return np.eye(count or labels.max() + 1, dtype=np.float32)[labels]
+
+
+@pytest.mark.parametrize(("weights", "rare"), [("none", 0.1), ("inverse_frequency", 0.5)])
+def test_a_probe_learns_how_frequent_predicates_are_unless_they_are_weighted(weights, rare):
+    """Labels that the features do not tell: a probability is a frequency (Eq. 10)."""
+    generator = np.random.default_rng(0)
+    labels = (np.arange(600) % 10 == 0).astype(np.int64)
+    inputs = generator.normal(size=(600, 4)).astype(np.float32)
+    rows = generator.permutation(600)
+    options = FitOptions(patience=5, learning_rate=1e-4, class_weights=weights)
+    found = fit(inputs, labels, rows, 400, options)
+    answers = found.probe.predict(inputs, np.zeros((600, 8), np.float32))
+    assert answers[:, 1].mean() == pytest.approx(rare, abs=0.07)
+
+
+def test_all_rooms_are_trained_on_and_a_pair_has_all_its_predicates(backbone, clips, tmp_path):
+    both = [replace(clip, predicates=("on", "near")) for clip in clips[:24]]
+    options = TrainingOptions(held_out_fraction=0, batch_size=16, fit=FitOptions(epochs=30))
+    metrics = train_probe(backbone, both, PREDICATES, tmp_path, options)
+    assert "held_out" not in metrics and metrics["train"]["clips"] == 24
+    assert (len(metrics["train_losses"]), metrics["validation_losses"]) == (30, [])
+    assert metrics["best_epoch"] == 29 and metrics["train"]["micro_accuracy"] == 1
+    assert metrics["train"]["log_loss_nats"] == pytest.approx(np.log(2), abs=0.05)
+    probe = load_probe(tmp_path)
+    assert probe.card.training["validation_by"] == "none"
+    features = backbone.encode([clip.read() for clip in both])
+    answers = probe.predict(features, np.zeros((24, 8), np.float32))
+    np.testing.assert_allclose(answers[:, [0, 2]], 0.5, atol=0.15)
 
 
 def test_a_rare_predicate_is_learnt_besides_a_frequent_one():
-    weights = class_weights(np.array([0, 0, 0, 2]), 4)
+    weights = class_weights(one_hot(np.array([0, 0, 0, 2]), 4))
     np.testing.assert_allclose(weights, [2 / 3, 0, 2, 0])
     generator = np.random.default_rng(0)
     labels = np.array([0] * 190 + [1] * 10)
@@ -182,7 +262,7 @@ def test_a_rare_predicate_is_learnt_besides_a_frequent_one():
     found = fit(inputs, labels, generator.permutation(200), 150, FitOptions(epochs=60))
     assert len(found.train_losses) == len(found.validation_losses) <= 60
     answers = found.probe.predict(inputs, np.zeros((200, 8), np.float32))
-    assert score(answers, labels, labels).macro_accuracy > 0.85
+    assert score(answers, one_hot(labels), one_hot(labels)).macro_accuracy > 0.85
     # Training stops where there is nothing to learn.
     inputs = generator.normal(size=(60, 8)).astype(np.float32)
     found = fit(inputs, generator.integers(0, 3, 60), np.arange(60), 40, FitOptions(patience=3))
@@ -190,8 +270,14 @@ def test_a_rare_predicate_is_learnt_besides_a_frequent_one():
 
 
 def test_scores_are_micro_and_macro():
-    answers = np.eye(3)[[0, 0, 0, 1]]
-    found = score(answers, np.array([0, 0, 1, 1]), np.array([0, 0, 0, 1]))
+    answers = np.eye(3)[[0, 0, 0, 1]] * 0.8 + 0.2 / 3
+    targets = one_hot(np.array([0, 0, 1, 1]), 3)
+    found = score(answers, targets, one_hot(np.array([0, 0, 0, 1]), 3))
     assert found.confusion.tolist() == [[2, 0, 0], [1, 1, 0], [0, 0, 0]]
     assert (found.micro_accuracy, found.macro_accuracy) == (0.75, 0.75)
     assert (found.chance_macro, found.majority_micro) == (0.5, 0.5)
+    right, wrong = -np.log(0.8 + 0.2 / 3), -np.log(0.2 / 3)
+    assert found.log_loss_nats == pytest.approx((3 * right + wrong) / 4)
+    # A clip with two predicates is right with either.
+    targets[2] = [0.5, 0.5, 0]
+    assert score(answers, targets, targets).micro_accuracy == 1

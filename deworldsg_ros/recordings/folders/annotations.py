@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -215,6 +217,7 @@ SPLIT_FILES = {
     "test": "test_scans.txt",
 }
 PLY_NAME = "labels.instances.annotated.v2.ply"
+FRL_APARTMENT = re.compile(r"\A(frl_apartment)_\d+\Z")
 ALIGNED_PLY_NAME = "labels.instances.align.annotated.v2.ply"
 
 
@@ -228,6 +231,7 @@ class Layout:
         objects, relations, mapping: JSON files.
         label_map, classes, predicates: keys in the mapping file.
         how_to_get: where a missing file can be downloaded, one sentence.
+        rooms: JSON file that says which scans show one room; empty = each scan is a room.
     """
 
     name: str
@@ -239,6 +243,7 @@ class Layout:
     classes: str
     predicates: str
     how_to_get: str
+    rooms: str = ""
 
 
 LAYOUTS = {
@@ -265,7 +270,8 @@ LAYOUTS = {
         "ScanNet_rel",
         "3DSSG/ comes from https://3dssg.github.io, data/ from 3RScan "
         "(https://github.com/WaldJohannaU/3RScan, after its terms are agreed to), 3DSSG_subset/ "
-        "from https://github.com/Howardkhh/FROSS",
+        "from https://github.com/Howardkhh/FROSS, 3RScan.json from the page of 3RScan",
+        "3RScan.json",
     ),
 }
 
@@ -338,6 +344,35 @@ class Annotations:
             raise RecordingError(f"split '{split}' is unknown: expected {', '.join(SPLIT_FILES)}")
         text = read_text(self._existing(f"{self.layout.lists}/{SPLIT_FILES[split]}"))
         return [line.strip() for line in text.splitlines() if line.strip()]
+
+    def room(self, scan: str) -> str:
+        """The room of a scan: of 3RScan its reference scan; raises RecordingError.
+
+        The six scans frl_apartment_N of Replica show one apartment with its furniture moved.
+        """
+        if not self.layout.rooms:
+            return FRL_APARTMENT.sub(r"\1", scan)
+        if scan not in self._room_of:
+            raise RecordingError(
+                f"{self.root / self.layout.rooms} does not list scan '{scan}': expected it as a "
+                "reference scan or as one of its rescans"
+            )
+        return self._room_of[scan]
+
+    @cached_property
+    def _room_of(self) -> dict[str, str]:
+        content = self._read_json(self.layout.rooms)
+        try:
+            return {
+                str(scan["reference"]): str(room["reference"])
+                for room in content
+                for scan in (room, *room.get("scans", ()))
+            }
+        except (AttributeError, KeyError, TypeError) as error:
+            raise RecordingError(
+                f"{self.root / self.layout.rooms}: expected a list of rooms, each with the key "
+                "reference, and scans, each with that key"
+            ) from error
 
     def scan(self, scan: str) -> ScanAnnotation:
         """The annotations of one scan; raises RecordingError."""
