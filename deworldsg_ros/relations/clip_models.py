@@ -397,7 +397,7 @@ def build_probed(
             config.probe_path,
             config.world_model_path,
         )
-    if config.edge_belief == "paper" and probe.card.inputs != "clip":
+    if config.edge_belief != "robust" and probe.card.inputs != "clip":
         logger.warning(
             "probe %s gets '%s'. The paper's probe gets the clip only: these are not the paper's "
             "results. For those, use a probe trained with --inputs clip",

@@ -109,4 +109,5 @@ def test_the_files_of_the_paper_differ_only_where_they_have_to(root_dir):
         "perception.segmenter": "sam3",
         "perception.segmenter_path": "./models/sam3",
         "relations.entropy_threshold_nats": 0.0,
+        "relations.edge_belief": "all_pairs",
     }
