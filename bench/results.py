@@ -29,8 +29,8 @@ RECORDING = "bags/demo_room --layout recording"
 SIMULATED = "SIMULATED --layout replica"
 FAULTS = "--flip 0.1 --miss 0.1 --jitter 2"
 ALL_PAIRS = "--set paper_rules:relations.edge_belief=all_pairs"
-# Ridges of Eq. 4, square metres. The configurations have 1e-6.
-RIDGES = ("1e-8", "1e-5", "1e-4", "1e-3")
+# Ridges of Eq. 4, square metres. The configurations have 1.0e-6.
+RIDGES = ("1.0e-8", "1.0e-5", "1.0e-4", "1.0e-3")
 # Arguments of `deworldsg evaluate table`, by the name of the run; the most important first.
 RUNS = {
     "rooms": f"main {ROOMS} --front-end recorded",
@@ -86,13 +86,13 @@ TABLES = {
         "recording_embedded_all_pairs": "recording, all pairs",
     },
     "ridge": {
-        name if ridge == "1e-6" else f"{what}_{ridge}": f"{what}, {ridge} m²"
+        name if ridge == "1.0e-6" else f"{what}_{ridge}": f"{what}, {ridge} m²"
         for what, name in (("rooms", "rooms"), ("recording", "recording_embedded"))
-        for ridge in sorted((*RIDGES, "1e-6"), key=float)
+        for ridge in sorted((*RIDGES, "1.0e-6"), key=float)
     },
 }
-# Methods of the tables that have not all.
-ONLY = {"pairs": ("paper_rules",), "ridge": ("paper_rules", "default")}
+# Tables of one method.
+ONLY = {"pairs": ("paper_rules",), "ridge": ("paper_rules",)}
 # The name of a row is METHOD or METHOD-INPUT.
 METHODS = {
     "fross": "FROSS",
