@@ -3,8 +3,8 @@
 Each run of `RUNS` is one `deworldsg evaluate table`; DIR keeps its figures. A run that DIR has is
 not repeated, and an interrupted one goes on where it stopped. Without folders, the tables are made
 from the figures that DIR has; a table stays if one of its runs has none. The rendered rooms (A) are
-not in the repository; tools/physics_rooms/make_rooms.py makes the simulated ones (B). No figure in
-the tables is typed by hand; the text around them is.
+not in the repository; tools/physics_rooms/make_rooms.py makes the simulated ones (B), and those of
+``--new C``. No figure in the tables is typed by hand; the text around them is.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ PLACE = re.compile(r"(?<=<!-- table: )(.*?) -->\n.*?(?=<!-- end -->)", re.DOTALL
 ROOMS = "ROOMS --layout replica --scan rooms_0 --scan rooms_1"
 RECORDING = "bags/demo_room --layout recording"
 SIMULATED = "SIMULATED --layout replica"
+NEW = "NEW --layout replica --scan phys_000 --scan phys_001 --scan phys_002 --scan phys_003"
 FAULTS = "--flip 0.1 --miss 0.1 --jitter 2"
 ALL_PAIRS = "--set paper_rules:relations.edge_belief=all_pairs"
 # Ridges of Eq. 4, square metres. The configurations have 1.0e-6.
@@ -47,6 +48,8 @@ RUNS = {
     "rooms_truth": f"main {ROOMS} --front-end ground-truth",
     "rooms_truth_faults": f"main {ROOMS} --front-end ground-truth {FAULTS}",
     "ablation": f"ablation {ROOMS} --front-end recorded",
+    "new_boxes": f"main {NEW} --front-end boxes",
+    "new_embedded": f"main {NEW} --front-end backend",
     "simulated_faults": f"hard {SIMULATED} --front-end ground-truth",
     "rooms_all_pairs": f"main {ROOMS} --front-end recorded {ALL_PAIRS}",
     "rooms_boxes_all_pairs": f"main {ROOMS} --front-end boxes {ALL_PAIRS}",
@@ -59,6 +62,7 @@ for ridge in RIDGES:
 
 # The runs of each table with the name of their input. A run of several inputs names them itself.
 TABLES = {
+    "new rooms": {"new_boxes": "true boxes", "new_embedded": "embedded"},
     "methods": {"rooms": "right labels", "rooms_flip": "a tenth of the labels is wrong"},
     "front ends": {
         "rooms_truth": "ground truth",
@@ -238,10 +242,11 @@ def main() -> None:
     parser.add_argument(
         "--simulated", type=Path, metavar="FOLDER", help="of tools/physics_rooms/make_rooms.py"
     )
+    parser.add_argument("--new", type=Path, metavar="FOLDER", help="likewise, of another seed")
     parser.add_argument("--workers", type=int, default=0, help="processes; default: one per core")
     options = parser.parse_args()
     out = options.out.resolve()
-    given = {"ROOMS": options.rooms, "SIMULATED": options.simulated}
+    given = {"ROOMS": options.rooms, "SIMULATED": options.simulated, "NEW": options.new}
     if folders := {name: folder.resolve() for name, folder in given.items() if folder}:
         run(out, folders, options.workers)
     files = {name: out / f"{name}.json" for name in RUNS}

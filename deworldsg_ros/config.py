@@ -134,7 +134,8 @@ class LiftingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Literal["refined", "mask", "box"],
         option(
             "pixels of an object: refined = mask with depth refinement (Eq. 1-2), mask = mask "
-            "only, box = box only; mask and box are the paper's ablation"
+            "only, box = the one at the centre of its box, as FROSS; mask and box are the paper's "
+            "ablation"
         ),
     ] = "refined"
 
@@ -305,6 +306,15 @@ class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float,
         option(
             "minimum probability of a published node that it is an object (surface rule); 0 = all",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.5
+    min_name: Annotated[
+        float,
+        option(
+            "minimum probability of the label of a published node; below it, the node is an "
+            "'object' with its classes as guesses; 0 = the most probable class, always",
             ge=0,
             le=1,
         ),

@@ -77,6 +77,7 @@ class GraphBuilder:
             self._edges.refresh,
             self._boxes,
             top_k=output.top_k,
+            min_name=output.min_name,
             include_surface_points=output.include_surface_points,
         )
         self.frames, self.space = FrameMemory(), SeenSpace()

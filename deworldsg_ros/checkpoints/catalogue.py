@@ -6,14 +6,20 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from deworldsg_ros.base.files import read_regular
-from deworldsg_ros.config import PerceptionConfig, RelationsConfig
+import msgspec
+
+from deworldsg_ros.base.files import parse_json, read_regular
+from deworldsg_ros.checkpoints.cards import WEIGHTS_FILE
+from deworldsg_ros.config import Config, PerceptionConfig, RelationsConfig
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # --- Published models: name, purpose, source and licence. Needs no torch and no network.
 
 # Folder of the models, below the working directory; config/paper.yaml has its paths there.
 MODELS_FOLDER = Path("models")
+# Folders of the embedded models.
+_PACKAGE = Path(__file__).parents[1]
+EMBEDDED = (_PACKAGE / "perception" / "weights", _PACKAGE / "relations" / "weights")
 
 
 @dataclass(frozen=True)
@@ -26,9 +32,9 @@ class Published:
         purpose: options that use it.
         licence: as its hub page states; `models get` shows the one of the download.
         note: classes and accuracy, as its authors publish them; empty = none.
-        parameters_m: millions of parameters, as published; 0 = not known here.
-        revision: commit that is fetched; empty = the newest.
-        sha256: of model.safetensors; empty = not known. Another content is refused.
+        parameters_m: millions of parameters, as published or counted; 0 = not known here.
+        revision: commit that is fetched; empty = not pinned, that of the first download is.
+        sha256: of model.safetensors; empty = not known, that of the first download counts.
     """
 
     name: str
@@ -41,14 +47,28 @@ class Published:
     sha256: str = ""
 
     def described(self) -> str:
-        """Note, size and licence, in words."""
-        size = f"{self.parameters_m:g} million parameters" if self.parameters_m else ""
-        pinned = f"commit {self.revision[:12]}" if self.revision else ""
-        return "; ".join(filter(None, (self.note, size, f"licence {self.licence}", pinned)))
+        """Note, size in float32, licence and pins, in words."""
+        parts = [self.note]
+        if self.parameters_m:
+            size = megabytes(4 * self.parameters_m)
+            parts.append(f"{self.parameters_m:g} million parameters, about {size}")
+        parts.append(f"licence {self.licence}")
+        if self.revision:
+            parts.append(f"commit {self.revision[:12]}{' and SHA-256' if self.sha256 else ''}")
+        return "; ".join(filter(None, parts))
 
 
-def _published(owner: str, purpose: str, licence: str, *names: str) -> list[Published]:
-    return [Published(name, f"{owner}/{name}", purpose, licence) for name in names]
+def megabytes(size_mb: float) -> str:
+    """A size in words, to three digits."""
+    return f"{size_mb / 1e3:.2f} GB" if size_mb >= 999.5 else f"{size_mb:.3g} MB"
+
+
+def _published(owner: str, purpose: str, licence: str, sizes: dict[str, float]) -> list[Published]:
+    """Models of one owner: millions of parameters by name."""
+    return [
+        Published(name, f"{owner}/{name}", purpose, licence, parameters_m=size)
+        for name, size in sizes.items()
+    ]
 
 
 def _detector(
@@ -72,9 +92,30 @@ def _dfine(size: str, parameters_m: float, coco: float, after_objects365: float)
 DETECTOR, SEGMENTER = "perception.detector: transformers", "perception.segmenter"
 TEXT_DETECTOR = "perception.detector: open_vocabulary"
 WORLD_MODEL = "relations.world_model"
-# Accuracy and parameters are those of the README of D-FINE, RT-DETR and RF-DETR, and of the paper
-# of Grounding DINO. Pins are those on which public code of several others agrees: nothing was
-# fetched for this list.
+# Millions of parameters, counted in the architectures of transformers at the published sizes; those
+# of SAM 2 have the memory of videos, those of V-JEPA 2 the predictor.
+SAM2_SIZES: dict[str, float] = {
+    "sam2.1-hiera-tiny": 39,
+    "sam2.1-hiera-small": 46.1,
+    "sam2.1-hiera-base-plus": 80.9,
+    "sam2.1-hiera-large": 224.4,
+}
+SAM_SIZES = {"sam-vit-base": 93.7, "sam-vit-large": 312.3, "sam-vit-huge": 641.1}
+VJEPA2_SIZES: dict[str, float] = {
+    "vjepa2-vitl-fpc64-256": 326,
+    "vjepa2-vith-fpc64-256": 654,
+    "vjepa2-vitg-fpc64-256": 1034.6,
+    "vjepa2-vitg-fpc64-384": 1034.6,
+}
+DINOV2_SIZES: dict[str, float] = {
+    "dinov2-small": 22.1,
+    "dinov2-base": 86.6,
+    "dinov2-large": 304.4,
+    "dinov2-giant": 1136.5,
+}
+SIGLIP2_SIZES = {"siglip2-base-patch16-224": 375.2}
+# Other numbers are of the README of D-FINE, RT-DETR and RF-DETR, and of Grounding DINO's paper.
+# Pins are those on which public code of several others agrees: nothing was fetched for this list.
 CATALOGUE = {
     model.name: model
     for model in (
@@ -112,35 +153,30 @@ CATALOGUE = {
             revision="cfd3195ba4ea9592eec887ded089f4c08eff231d",
         ),
         _detector("omlab/omdet-turbo-swin-tiny-hf", "free text; needs timm", 0, TEXT_DETECTOR),
-        *_published(
-            *("facebook", f"{SEGMENTER}: sam2", "apache-2.0"),
-            *(f"sam2.1-hiera-{size}" for size in ("tiny", "small", "base-plus", "large")),
-        ),
-        *_published("facebook", f"{SEGMENTER}: sam", "apache-2.0", "sam-vit-base", "sam-vit-large"),
+        *_published("facebook", f"{SEGMENTER}: sam2", "apache-2.0", SAM2_SIZES),
+        *_published("facebook", f"{SEGMENTER}: sam", "apache-2.0", SAM_SIZES),
         *_published(
             *("facebook", f"{SEGMENTER}: sam3, or {TEXT_DETECTOR}"),
-            *("SAM licence; accept it there", "sam3"),
+            *("SAM licence; accept it there", {"sam3": 0.0}),
         ),
-        *_published(
-            *("facebook", f"{WORLD_MODEL}: vjepa2", "mit"),
-            *("vjepa2-vitl-fpc64-256", "vjepa2-vitg-fpc64-256", "vjepa2-vitg-fpc64-384"),
-        ),
-        *_published(
-            *("facebook", f"{WORLD_MODEL}: dinov2", "apache-2.0"),
-            *("dinov2-small", "dinov2-base", "dinov2-large"),
-        ),
-        *_published("google", "perception.embedder", "apache-2.0", "siglip2-base-patch16-224"),
+        *_published("facebook", f"{WORLD_MODEL}: vjepa2", "mit", VJEPA2_SIZES),
+        *_published("facebook", f"{WORLD_MODEL}: dinov2", "apache-2.0", DINOV2_SIZES),
+        *_published("google", "perception.embedder", "apache-2.0", SIGLIP2_SIZES),
     )
 }
 # Names that stand for several models. The embedded models are part of the package.
 GROUPS: dict[str, tuple[str, ...]] = {
-    "paper": ("sam2.1-hiera-tiny", "vjepa2-vitg-fpc64-384"),
+    # DINOv2 is for row (d) of the ablation, in the size of that V-JEPA 2.
+    "paper": ("sam2.1-hiera-tiny", "vjepa2-vitg-fpc64-384", "dinov2-giant"),
     "embedded": (),
     # Names 365 things of households, and runs on a CPU.
     "detector": ("dfine-small-obj365",),
     # Apache licence, no further package, and a published accuracy.
     "open-vocabulary": ("grounding-dino-tiny",),
 }
+TRAIN_DINOV2_PROBE = (
+    "run `deworldsg train-probe CLIPS --world-model dinov2 --model MODEL --out {folder}`"
+)
 # What the paper needs and the hub does not have: folder, content, how to get it.
 NOT_ON_THE_HUB = (
     (
@@ -155,21 +191,38 @@ NOT_ON_THE_HUB = (
         "run `deworldsg import-probe vjepa_probe_mlp.pt {folder} --predicates 3dssg` for the "
         "published probe, or `deworldsg train-probe` for one of your own",
     ),
+    ("probe_dinov2_3dssg", "probe of DINOv2 for row (d) of the ablation", TRAIN_DINOV2_PROBE),
 )
 
 
+# The file that names the shards of weights that are not in one file.
+INDEX_FILE = "model.safetensors.index.json"
+# A config.json of Objects365 has 30 kB, an index of 40 thousand parameters 4 MB.
+MAX_CONFIG_BYTES = 8_000_000
+
+
 def is_complete(folder: Path) -> bool:
-    """Whether a folder has a configuration and weights, and no part of a download."""
-    weights = list(folder.glob("*.safetensors")) if folder.is_dir() else []
-    return bool(weights) and (folder / "config.json").is_file()
+    """Whether a folder has a configuration and all of its weights, in one file or in shards."""
+    names = {WEIGHTS_FILE}
+    if not (folder / WEIGHTS_FILE).is_file():
+        try:
+            index = parse_json(read_regular(folder / INDEX_FILE, MAX_CONFIG_BYTES), _Index)
+        except (OSError, ValueError):
+            return False
+        names = set(index.weight_map.values())
+    return bool(names) and all((folder / name).is_file() for name in ("config.json", *names))
+
+
+class _Index(msgspec.Struct):
+    """The index of weights in shards: the file of each parameter."""
+
+    weight_map: dict[str, str]
 
 
 # --- The checkpoints that a configuration needs, and how to get the missing ones. Needs no torch.
 
 # An exported detector, in a folder with a description.
 ONNX_FILE = "model.onnx"
-# A config.json of Objects365 has 30 kB.
-MAX_CONFIG_BYTES = 4_000_000
 # How to get the checkpoint of a backend: title, name for `deworldsg models get`.
 DETECTORS = {
     "transformers": ("detector", "dfine-small-obj365"),
@@ -227,9 +280,24 @@ def unused_detector(config: PerceptionConfig, into: Path = MODELS_FOLDER) -> tup
     return "", ""
 
 
+def checkpoints_of(config: Config) -> list[str]:
+    """Folders and hub ids of all checkpoints of a configuration, first those in the package."""
+    perception, relations = config.perception, config.relations
+    names = (
+        *(perception.detector_path, perception.segmenter_path, perception.embedder),
+        *(relations.world_model_path, relations.probe_path),
+    )
+    return [*map(str, EMBEDDED), *filter(None, names)]
+
+
+# Files that torch wrote. Only `import-fross` and `import-probe` read some.
+ORIGINAL = (".pt", ".pth", ".ckpt")
+
+
 def is_hub_id(name: str) -> bool:
     """Whether the name of a checkpoint has the form of a hub id, ``owner/model``."""
-    return not name.startswith(("/", "~", ".")) and name.count("/") == 1
+    is_path = name.startswith(("/", "~", ".")) or name.endswith(ORIGINAL)
+    return not is_path and name.count("/") == 1
 
 
 def is_folder(name: str) -> bool:
@@ -264,7 +332,7 @@ def missing_perception(config: PerceptionConfig) -> list[str]:
         if config.detector == "onnx":
             advice = "run `deworldsg models export NAME {folder}`"
         elif config.relation_head == "egtr":
-            (_, title, advice), _ = NOT_ON_THE_HUB
+            (_, title, advice), *_ = NOT_ON_THE_HUB
         else:
             advice = _get(config.detector_path, name)
         lines.append(_line(title, "perception.detector_path", config.detector_path, advice))
@@ -288,22 +356,40 @@ def missing_world_model(config: RelationsConfig) -> list[str]:
         advice = _get(config.world_model_path, name)
         parts.append(_line(title, "relations.world_model_path", config.world_model_path, advice))
     if not is_folder(config.probe_path):
-        _, (_, _, advice) = NOT_ON_THE_HUB
+        advice = NOT_ON_THE_HUB[1][2]
+        if config.world_model == "dinov2":
+            advice = TRAIN_DINOV2_PROBE
         probe = f"probe of {title}"
         parts.append(_line(probe, "relations.probe_path", config.probe_path, advice))
     return ["; ".join(parts)] if parts else []
 
 
 def _is_missing(name: str) -> bool:
-    return not is_folder(name) and not is_hub_id(name)
+    return _is_original(name) or (not is_folder(name) and not is_hub_id(name))
+
+
+def _is_original(name: str) -> bool:
+    """Whether a checkpoint is a file of its authors' own layout, or a folder with nothing else."""
+    path = Path(name).expanduser()
+    if not is_folder(name):
+        return name.endswith(ORIGINAL) and path.is_file()
+    files = [file.name for file in path.glob("*")]
+    return "config.json" not in files and any(file.endswith(ORIGINAL) for file in files)
 
 
 def _get(name: str, default: str) -> str:
     """The command that gets a model into the folder of this name."""
     folder = Path(name)
-    model = folder.name if folder.name in CATALOGUE else default
+    same = folder.stem.replace("_", "-") if name.endswith(ORIGINAL) else folder.name
+    model = same if same in CATALOGUE else default
     into = "" if folder.parent == MODELS_FOLDER or not name else f" --into {folder.parent}"
-    return f"run `deworldsg models get {model}{into}`"
+    run = f"run `deworldsg models get {model}{into}`"
+    if not _is_original(name):
+        return run
+    return (
+        f"this is its authors' own layout, which is not read; {run}, which brings the layout of "
+        f"transformers, and set the option to {folder.parent / model}"
+    )
 
 
 def _line(title: str, parameter: str, name: str, advice: str) -> str:

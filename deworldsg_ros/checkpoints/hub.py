@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import msgspec
 
-from deworldsg_ros.base.files import confined, parse_json, write_atomically
-from deworldsg_ros.checkpoints.cards import WEIGHTS_FILE
+from deworldsg_ros.base.files import confined, parse_json, read_regular, write_atomically
+from deworldsg_ros.checkpoints.catalogue import INDEX_FILE, is_hub_id
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # --- Names, dtypes and shapes of a checkpoint's parameters, without its weights.
@@ -120,11 +124,15 @@ def _entries(content: Any) -> Iterator[tuple[str, Any]]:
 
 # --- Download of a model from the Hugging Face hub: only what is used, resumed and verified.
 
+# Of a lock: a line for each of some ten files.
+MAX_LOCK_BYTES = 100_000
+_LOCKED = re.compile(r"(?P<sum>[0-9a-f]{64})  (?P<of>[^/]+)/(?P<name>[^/]+)")
+NO_SUMS: Mapping[str, str] = MappingProxyType({})
 # Configuration, weights in safetensors (no pickles), preprocessing, tokenizer, licence.
 USED_FILES = (
     "config.json",
     "model*.safetensors",
-    "model.safetensors.index.json",
+    INDEX_FILE,
     "pre*processor_config.json",
     "processor_config.json",
     # Of texts.
@@ -133,9 +141,66 @@ USED_FILES = (
     "LICENSE*",
     "README.md",
 )
-# Checksums of a folder, for `sha256sum -c` on another machine.
-SUMS_FILE = "SHA256SUMS"
 CHUNK_BYTES = 1 << 22
+
+
+@dataclass(frozen=True)
+class Lock:
+    """What the first download of a model brought: `NAME.sha256` beside its folder.
+
+    The file has a line ``# REPOSITORY COMMIT`` and those of `sha256sum -c`. A later download is of
+    this commit, and of this content.
+
+    Attributes:
+        repository, commit: of the hub.
+        sums: SHA-256 by file name.
+    """
+
+    repository: str
+    commit: str
+    sums: dict[str, str]
+
+    @staticmethod
+    def path(folder: Path) -> Path:
+        """The file of the lock of a model's folder."""
+        return folder.with_name(f"{folder.name}.sha256")
+
+    @staticmethod
+    def read(folder: Path) -> Lock | None:
+        """The lock of a model's folder; None if it has none.
+
+        Raises:
+            ConfigurationError: a file that cannot be read, or is no lock.
+        """
+        path = Lock.path(folder)
+        try:
+            first, *lines = read_regular(path, MAX_LOCK_BYTES).decode().splitlines()
+            mark, repository, commit = first.split(" ")
+            found = [_LOCKED.fullmatch(line) for line in lines]
+            sums = {
+                item["name"]: item["sum"] for item in found if item and item["of"] == folder.name
+            }
+            if mark != "#" or not sums or len(sums) != len(lines):
+                raise ValueError("other lines")
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            raise ConfigurationError(
+                f"{path}: {error}; expected '# OWNER/NAME COMMIT' and lines of sha256sum for files "
+                f"of {folder.name}/: remove it if you trust the next download"
+            ) from error
+        return Lock(repository, commit, sums)
+
+    def write(self, folder: Path) -> None:
+        """Write the lock beside a model's folder."""
+        lines = [f"{value}  {folder.name}/{name}\n" for name, value in self.sums.items()]
+        text = "".join([f"# {self.repository} {self.commit}\n", *lines])
+        write_atomically(Lock.path(folder), text)
+
+    def holds(self, folder: Path) -> bool:
+        """Whether the folder has every file, with its content."""
+        paths = {folder / name: value for name, value in self.sums.items()}
+        return all(path.is_file() and sha256(path) == value for path, value in paths.items())
 
 
 @dataclass(frozen=True)
@@ -197,7 +262,8 @@ class Hub:
                 f"sha256:{file.lfs.sha256}" if file.lfs else f"git:{file.blob_id}",
             )
             for file in info.siblings or ()
-            if any(fnmatch(file.rfilename, pattern) for pattern in USED_FILES)
+            if "/" not in file.rfilename
+            and any(fnmatch(file.rfilename, pattern) for pattern in USED_FILES)
         )
         if not any(file.name.endswith(".safetensors") for file in files):
             raise ConfigurationError(
@@ -212,9 +278,10 @@ class Hub:
         model: RemoteModel,
         folder: Path,
         report: Callable[[str], None] = lambda line: None,
-        sha256_of_weights: str = "",
+        sums: Mapping[str, str] = NO_SUMS,
+        source: str = "the catalogue",
     ) -> None:
-        """Download the files into a folder, verify them, and write SHA256SUMS.
+        """Download the files into a folder, verify them, and write their lock.
 
         A file that is there and has its checksum is kept; a partial download continues.
 
@@ -222,24 +289,22 @@ class Hub:
             model: result of `find`.
             folder: created if missing.
             report: gets a line for each file.
-            sha256_of_weights: of model.safetensors; empty = any that the hub names.
+            sums: SHA-256 by name; other files may have any content that the hub names.
+            source: of `sums`, for messages.
 
         Raises:
             ConfigurationError: no access, no network, or a file with another checksum.
         """
-        for file in model.files if sha256_of_weights else ():
-            pinned = f"sha256:{sha256_of_weights}"
-            if file.name == WEIGHTS_FILE and file.checksum != pinned:
-                raise ConfigurationError(
-                    f"{model.repository}, commit {model.commit}: {file.name} has {file.checksum} "
-                    f"on the hub, and the catalogue expects {pinned}: nothing was fetched. If its "
-                    f"authors changed it and you trust them, name it as {model.repository}"
-                )
-        sums = []
+        for file in model.files:
+            if file.checksum.startswith("sha256:"):
+                _check(model, file, file.checksum[7:], sums, source)
+        found = {}
         for file in model.files:
             path = confined(folder, file.name)
             known = path.is_file() and _matches(path, file.checksum)
             if not known:
+                # The client keeps a file that was changed a second ago.
+                path.unlink(missing_ok=True)
                 self._download(model, file, folder)
                 if not _matches(path, file.checksum):
                     path.unlink(missing_ok=True)
@@ -247,9 +312,14 @@ class Hub:
                         f"{path} has another checksum than {file.checksum} of the hub, and was "
                         "removed: run the command again"
                     )
+            found[file.name] = sha256(path)
+            try:
+                _check(model, file, found[file.name], sums, source)
+            except ConfigurationError:  # of a small file, the hub has no SHA-256
+                path.unlink()
+                raise
             report(f"{file.name}: {file.size / 1e6:.1f} MB, {'was there' if known else 'verified'}")
-            sums.append(f"{sha256(path)}  {file.name}\n")
-        write_atomically(folder / SUMS_FILE, "".join(sums))
+        Lock(model.repository, model.commit, found).write(folder)
 
     def _download(self, model: RemoteModel, file: RemoteFile, folder: Path) -> None:
         try:
@@ -260,9 +330,52 @@ class Hub:
             raise ConfigurationError(_advice(model.repository, error)) from error
 
 
+def _check(
+    model: RemoteModel, file: RemoteFile, found: str, sums: Mapping[str, str], source: str
+) -> None:
+    expected = sums.get(file.name, found)
+    if found != expected:
+        raise ConfigurationError(
+            f"{model.repository}, commit {model.commit}: {file.name} has sha256:{found} on the "
+            f"hub, and {source} expects sha256:{expected}: it is not used. If its authors changed "
+            f"it and you trust them, remove its .sha256 file and name it as {model.repository}"
+        )
+
+
 def sha256(path: Path) -> str:
     """SHA-256 of a file, hexadecimal."""
     return _digest(path, hashlib.sha256())
+
+
+def fingerprint_of(name: str) -> dict[str, str]:
+    """SHA-256 of each file of a checkpoint by its name; empty if it is not here.
+
+    Hidden files and folders are no part of a checkpoint. A file is hashed once in a process, and
+    again if it was written since.
+
+    Args:
+        name: a folder, or a hub id whose files are in the local cache.
+    """
+    folder = Path(name).expanduser()
+    if not folder.is_dir() and is_hub_id(name):
+        with suppress(ImportError):
+            from huggingface_hub import try_to_load_from_cache
+
+            found = try_to_load_from_cache(name, "config.json")
+            folder = Path(found).parent if isinstance(found, str) else folder
+    paths = [path for path in sorted(folder.glob("[!.]*")) if path.is_file()]
+    return {path.name: _sha256_as_written(path, *_written(path)) for path in paths}
+
+
+def _written(path: Path) -> tuple[int, ...]:
+    """What differs between two contents of a path."""
+    found = path.stat()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+
+
+@lru_cache(1024)
+def _sha256_as_written(path: Path, *written: int) -> str:
+    return sha256(path)
 
 
 def _matches(path: Path, checksum: str) -> bool:

@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from deworldsg_ros.base.words import visible
+from deworldsg_ros.base.words import visible_lines
 from deworldsg_ros.cli.configuration import EXIT_NOTHING_DONE, effective_config
 from deworldsg_ros.cli.evaluate_options import (
     DataOptions,
@@ -156,7 +156,7 @@ def run_scans(
     ]
     outcomes, failures = _run_all(tasks, console)
     for scan, reason in failures.items():
-        line = Text.assemble(("failed:", "red"), " " + visible(f"{scan}: {reason}"))
+        line = Text.assemble(("failed:", "red"), " " + visible_lines(f"{scan}: {reason}"))
         console.print(line, highlight=False, soft_wrap=True)
     if not outcomes:
         raise typer.Exit(EXIT_NOTHING_DONE)

@@ -18,7 +18,7 @@ from rich.table import Table
 from deworldsg_ros.base.files import parse_json, read_regular
 from deworldsg_ros.base.plugins import PARAMETERS, plugins, source_of
 from deworldsg_ros.base.words import visible, visible_lines
-from deworldsg_ros.checkpoints.cards import MAX_CARD_BYTES
+from deworldsg_ros.checkpoints.cards import MAX_CARD_BYTES, WEIGHTS_FILE
 from deworldsg_ros.checkpoints.catalogue import (
     CATALOGUE,
     DETECTOR,
@@ -30,8 +30,9 @@ from deworldsg_ros.checkpoints.catalogue import (
     detector_of,
     is_complete,
     is_hub_id,
+    megabytes,
 )
-from deworldsg_ros.checkpoints.hub import SUMS_FILE, Hub, ParameterHeader, read_headers
+from deworldsg_ros.checkpoints.hub import Hub, Lock, ParameterHeader, read_headers
 from deworldsg_ros.cli.configuration import EXIT_USAGE
 from deworldsg_ros.client.meanings import is_class
 from deworldsg_ros.config import Config, PerceptionConfig
@@ -59,30 +60,62 @@ def get_models(names: list[str], into: Path, console: Console) -> None:
     chosen = [model for name in names for model in _models_of(name)]
     if "embedded" in names:
         console.print("embedded: the weights are part of the package; nothing to download")
-    if chosen:
-        hub = Hub()
-        for published in chosen:
-            model = hub.find(published.repository, published.revision)
-            folder = into / published.name
-            console.print(
-                f"{model.repository}, commit {model.commit[:12]}, licence {model.licence}, "
-                f"{model.size / 1e9:.2f} GB → {folder}"
-            )
-            if published.name in CATALOGUE:
-                console.print(f"  {published.described()}")
-            _make_folder(folder)
-            hub.fetch(model, folder, lambda line: console.print(f"  {line}"), published.sha256)
-            if published.purpose in (DETECTOR, TEXT_DETECTOR):
-                words = " --set 'perception.words=[mug, red mug, drill]'"
-                console.print(
-                    f"use it: --set {published.purpose.replace(': ', '=')} --set "
-                    f"perception.detector_path={folder}"
-                    f"{words if published.purpose == TEXT_DETECTOR else ''}"
-                )
+    for published in chosen:
+        _get_model(published, into / published.name, console)
     if "paper" in names:
         for name, title, advice in NOT_ON_THE_HUB:
             if not (into / name).is_dir():
                 console.print(f"{title} is not on the hub: {advice.format(folder=into / name)}")
+
+
+def _get_model(published: Published, folder: Path, console: Console) -> None:
+    """Download a model, unless it is there as its lock says."""
+    lock = Lock.read(folder)
+    if lock is not None and not _agree(lock, published):
+        lock = None
+    if lock is not None and lock.holds(folder):
+        console.print(f"{folder}: complete, and as {Lock.path(folder)} says")
+    else:
+        _fetch(published, folder, lock, console)
+    if published.purpose in (DETECTOR, TEXT_DETECTOR):
+        words = " --set 'perception.words=[mug, red mug, drill]'"
+        console.print(
+            f"use it: --set {published.purpose.replace(': ', '=')} --set "
+            f"perception.detector_path={folder}"
+            f"{words if published.purpose == TEXT_DETECTOR else ''}"
+        )
+
+
+def _agree(lock: Lock, published: Published) -> bool:
+    """Whether a lock is of a model as the catalogue has it, which may be newer."""
+    return (
+        lock.repository == published.repository
+        and published.revision in ("", lock.commit)
+        and published.sha256 in ("", lock.sums.get(WEIGHTS_FILE))
+    )
+
+
+def _fetch(published: Published, folder: Path, lock: Lock | None, console: Console) -> None:
+    pins = {WEIGHTS_FILE: published.sha256} if published.sha256 else {}
+    try:
+        hub = Hub()
+        model = hub.find(published.repository, lock.commit if lock else published.revision)
+    except ConfigurationError as error:
+        # The weights of an entry with a SHA-256 need no hub.
+        if lock or not is_complete(folder) or (pins and not Lock("", "", pins).holds(folder)):
+            raise
+        known = "verified by the SHA-256 of its weights" if pins else "not verified"
+        console.print(f"{folder}: complete, and {known}: no {Lock.path(folder)}; {error}")
+        return
+    console.print(
+        f"{model.repository}, commit {model.commit[:12]}, licence {model.licence}, "
+        f"{megabytes(model.size / 1e6)} → {folder}"
+    )
+    if published.name in CATALOGUE:
+        console.print(f"  {published.described()}")
+    _make_folder(folder)
+    sums, source = (lock.sums, str(Lock.path(folder))) if lock else (pins, "the catalogue")
+    hub.fetch(model, folder, lambda line: console.print(f"  {line}"), sums, source)
 
 
 def list_models(folder: Path, console: Console) -> None:
@@ -90,25 +123,28 @@ def list_models(folder: Path, console: Console) -> None:
     console.print("in the package: NanoDet-g (detector), embedded world model; no download")
     paper = GROUPS["paper"]
     for name, model in CATALOGUE.items():
-        state = _state(folder / name)
-        mark = ", of config/paper.yaml" if name in paper else ""
-        console.print(f"{state:10} {name}: {model.purpose}{mark}; {model.described()}")
+        state, size = _state(folder / name), _size(folder / name)
+        mark = ", of the paper" if name in paper else ""
+        console.print(f"{state:10} {name}: {model.purpose}{mark}; {model.described()}{size}")
     for name, title, advice in NOT_ON_THE_HUB:
         state = _state(folder / name)
-        how = "" if state == "there" else f"; {advice.format(folder=folder / name)}"
-        console.print(f"{state:10} {name}: {title}, of config/paper.yaml{how}")
+        how = (
+            _size(folder / name) if state == "there" else f"; {advice.format(folder=folder / name)}"
+        )
+        console.print(f"{state:10} {name}: {title}, of the paper{how}")
     known = {*CATALOGUE, *(name for name, _, _ in NOT_ON_THE_HUB)}
     others = sorted(path.name for path in folder.iterdir()) if folder.is_dir() else []
     for name in others:
         if name not in known and is_complete(folder / name):
-            console.print(f"{'there':10} {name}")
+            console.print(f"{'there':10} {name}{_size(folder / name)}")
     for parameter in PARAMETERS:
         for name, point in plugins(parameter).items():
             console.print(f"{'plug-in':10} {name}: {parameter}, of {source_of(point)}")
     console.print(
-        f"\nget one: deworldsg models get NAME --into {folder}\n"
+        f"\nget one: deworldsg models get NAME --into {folder}; without a commit here, the first "
+        "download is trusted, and NAME.sha256 holds later ones to it\n"
         f"for a machine without network: run that elsewhere, copy the folder {folder}, and run "
-        f"`sha256sum -c {SUMS_FILE}` in each of its folders there"
+        "`sha256sum -c *.sha256` in it there"
     )
 
 
@@ -328,6 +364,12 @@ def _state(folder: Path) -> str:
     return "there" if is_complete(folder) else "incomplete"
 
 
+def _size(folder: Path) -> str:
+    """Bytes of the files of a folder, in words; empty without one."""
+    sizes = [path.stat().st_size for path in folder.glob("*") if path.is_file()]
+    return f"; {megabytes(sum(sizes) / 1e6)} here" if sizes else ""
+
+
 def _values(header: ParameterHeader) -> int:
     count = 1
     for size in header.shape:
@@ -379,7 +421,7 @@ def get(
 
 @app.command("list")
 def list_command(into: IntoFolder = MODELS_FOLDER) -> None:
-    """List models that are there or missing, with their licences."""
+    """List models that are there or missing, with sizes and licences."""
     with _terminal() as console:
         list_models(into, console)
 

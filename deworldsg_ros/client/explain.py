@@ -57,7 +57,8 @@ def explain_object(
     if item.is_labelled_by_hand:
         lines.append(f"class: {item.label}, set by the operator")
     else:
-        lines.append(f"class: {names}; all others {item.other_classes:.0%}")
+        kind = "class" if item.is_named else "no class is probable enough for a name"
+        lines.append(f"{kind}: {names}; all others {item.other_classes:.0%}")
     if not item.is_sure:
         lines.append(f"not sure: it is a {item.label} with {item.probability:.0%} in all")
     looks = f"{len(item.surface_m)} surface points" if len(item.surface_m) else "no surface points"

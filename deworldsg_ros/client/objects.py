@@ -53,7 +53,7 @@ class SceneObject:
 
     Attributes:
         id: stable, never reused within one graph.
-        label: most probable class.
+        label: most probable class; "object" if none is probable enough (`is_named`).
         classes: probabilities of the classes that the message lists, the best first.
         other_classes: probability of all classes that it does not list.
         existence: probability that this is an object at all; None = not estimated.
@@ -97,7 +97,9 @@ class SceneObject:
 
     @property
     def probability(self) -> float:
-        """Probability that this is an object, and of the class `label`."""
+        """Probability that this is an object, and of the class `label` if it is named."""
+        if not self.is_named:
+            return 1.0 if self.existence is None else self.existence
         return self._share(belief for belief in self.classes if belief.label == self.label)
 
     def probability_of(self, label: str) -> float:
@@ -112,6 +114,11 @@ class SceneObject:
     def is_sure(self) -> bool:
         """Whether `probability` is at least `SURE`."""
         return self.probability >= SURE
+
+    @property
+    def is_named(self) -> bool:
+        """False if no class is probable enough for a name: `classes` are guesses then."""
+        return self.state.named
 
     @property
     def is_labelled_by_hand(self) -> bool:
@@ -174,6 +181,7 @@ class SceneObject:
             "label": self.label,
             "probability": round(self.probability, 3),
             "sure": self.is_sure,
+            "named": self.is_named,
             "labelled_by_hand": self.is_labelled_by_hand,
             "classes": {belief.label: round(belief.probability, 3) for belief in self.classes},
             "other_classes": round(self.other_classes, 3),

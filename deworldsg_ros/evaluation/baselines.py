@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from deworldsg_ros.base.timing import Times, timed
 from deworldsg_ros.graph.messages import listed
+from deworldsg_ros.lifting.stage import box_covariance, whole_box
 from deworldsg_ros.pipeline import Perceiver, watch_parts
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
@@ -331,31 +332,6 @@ class Fross:
         weights = weights / weights.sum() if weights.sum() > 0 else np.array([0.5, 0.5])
         scores = weights[0] * keeper.class_scores + weights[1] * other.class_scores
         return fuse_nodes(keeper, other, scores)
-
-
-def whole_box(box_xyxy: Float64) -> tuple[int, int, int, int]:
-    """Centre column, centre row, width and height of a box, truncated to whole pixels."""
-    x1, y1, x2, y2 = box_xyxy.tolist()
-    return int((x1 + x2) / 2), int((y1 + y2) / 2), int(x2 - x1), int(y2 - y1)
-
-
-def box_covariance(
-    u: int, v: int, width: int, height: int, depth_m: float, intrinsics: Intrinsics
-) -> Float64:
-    """Covariance of a box's object in the camera frame, (3, 3) square metres.
-
-    The box is a uniform distribution with covariance diag(w², h²) / 12. The pseudo-inverse of the
-    Jacobian of the projection, J = [[fx/Z, 0, -x fx/Z²], [0, fy/Z, -y fy/Z²]], maps it to 3D, with
-    x, y in normalised image coordinates as in the released code. The mean of the variances of x and
-    y is added to that of z.
-    """
-    x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
-    fx, fy = intrinsics.fx / depth_m, intrinsics.fy / depth_m
-    jacobian = np.array([[fx, 0.0, -x * fx / depth_m], [0.0, fy, -y * fy / depth_m]])
-    inverse = np.linalg.pinv(jacobian)
-    covariance = inverse @ np.diag([width**2 / 12.0, height**2 / 12.0]) @ inverse.T
-    covariance[2, 2] += (covariance[0, 0] + covariance[1, 1]) / 2
-    return np.asarray(covariance, np.float64)
 
 
 def evaluation_points(

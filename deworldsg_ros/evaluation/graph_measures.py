@@ -56,6 +56,7 @@ class NodeView(NamedTuple):
     points_m: Float64
     weight: float
     observations: int = 0
+    is_named: bool = True
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class Measures:
         matched: nodes whose mean is in the box of an object of their class.
         wrong_class: nodes whose mean is only in boxes of objects of other classes.
         stray: nodes whose mean is in no box.
+        named, named_matched: nodes that have a name, and those of them that are matched.
         edges: of the graph, beside the annotation.
         relations: annotated relations between objects that can be detected, each with the edge that
             states it best.
@@ -86,6 +88,8 @@ class Measures:
     matched: int = 0
     wrong_class: int = 0
     stray: int = 0
+    named: int = 0
+    named_matched: int = 0
     edges: list[JudgedEdge] = field(default_factory=list)
     relations: list[JudgedEdge] = field(default_factory=list)
     best_errors_m: list[float] = field(default_factory=list)
@@ -117,6 +121,8 @@ class Measures:
             "stray": self.stray,
             "node_recall": _ratio(self.found, self.objects),
             "node_precision": node_precision,
+            "named": self.named,
+            "named_precision": _ratio(self.named_matched, self.named),
             "duplicates_per_object": _ratio(self.duplicates, self.found),
             "f1": _ratio(2 * self.found, self.nodes + self.objects),
             "centroid_error_best_median_m": _quantile(self.best_errors_m, 0.5),
@@ -146,6 +152,7 @@ def measure(graph: wire.SceneGraphMessage, reference: ReferenceScene) -> Measure
             # Between nodes with equal numbers of observations, the points decide.
             node.observations + 1e-6 * len(points),
             node.observations,
+            node.named,
         )
         for node, points in zip(graph.nodes, map(surface_points, graph.nodes))
     ]
@@ -190,6 +197,8 @@ def measure_views(
         matched=assignment.counts["matched"],
         wrong_class=assignment.counts["wrong_class"],
         stray=assignment.counts["stray"],
+        named=sum(node.is_named for node in nodes),
+        named_matched=assignment.counts["named_matched"],
         edges=judged,
         relations=relations,
         **_geometric_errors(assignment.nodes_of, reference),
@@ -230,6 +239,7 @@ def _assign(nodes: Sequence[NodeView], reference: ReferenceScene) -> _Assignment
         row = _nearest(node.mean_m, own or inside, reference)
         result.confusion.append((reference.labels[row], node.label))
         if own:
+            result.counts["named_matched"] += node.is_named
             result.nodes_of.setdefault(row, []).append(node)
             result.object_of[node.id] = reference.ids[row]
     return result

@@ -83,13 +83,17 @@ def translation(annotations: Annotations) -> dict[str, str]:
 def translate(graph: wire.SceneGraphMessage, annotations: Annotations) -> wire.SceneGraphMessage:
     """The graph with classes of the data set; probabilities of labels of one class are added.
 
+    The label is the most probable class, also of a node without a name.
+
     Mutual edges are in both directions, as in the ground truth.
     """
     if any(edge.mutual is True for edge in graph.edges):
         graph = msgspec.structs.replace(graph, edges=_both_directions(graph.edges))
     names = translation(annotations)
     if not any(belief.label in names for node in graph.nodes for belief in node.classes):
-        return graph
+        names = {}
+        if all(node.named for node in graph.nodes):
+            return graph
     nodes = []
     for node in graph.nodes:
         sums: dict[str, float] = {}

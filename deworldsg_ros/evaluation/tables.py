@@ -22,7 +22,9 @@ from rich.text import Text
 from deworldsg_ros import __version__
 from deworldsg_ros.base.files import together, write_atomically
 from deworldsg_ros.base.timing import STAGES
-from deworldsg_ros.base.words import visible
+from deworldsg_ros.base.words import visible_lines
+from deworldsg_ros.checkpoints.catalogue import checkpoints_of
+from deworldsg_ros.checkpoints.hub import fingerprint_of
 from deworldsg_ros.evaluation import graph_measures as measures
 from deworldsg_ros.evaluation import reports
 from deworldsg_ros.evaluation import scoring as protocol
@@ -97,12 +99,14 @@ def run_job(job: Job) -> JobResult:
     """
     task = job.task
     folder = task.out / task.scan
-    saved = None if job.fresh else read_saved(folder, fingerprint(task))
-    if saved is not None:
-        return JobResult(job.row, task.scan, saved, reused=True)
     try:
+        # Before the run: weights that are replaced during it did not make its result.
+        inputs = fingerprint(task)
+        saved = None if job.fresh else read_saved(folder, inputs)
+        if saved is not None:
+            return JobResult(job.row, task.scan, saved, reused=True)
         outcome = evaluate_scan(task)
-        _save(folder, _Saved(fingerprint(task), outcome))
+        _save(folder, _Saved(inputs, outcome))
     except DeWorldSGError as error:
         return JobResult(job.row, task.scan, None, str(error))
     except Exception as error:  # a failed scan must not stop the others
@@ -114,10 +118,14 @@ def run_job(job: Job) -> JobResult:
 
 
 def fingerprint(task: ScanTask) -> str:
-    """Hash of all inputs of a task except the content of the data set."""
+    """Hash of all inputs of a task: options and the content of checkpoints.
+
+    The content of the data set, code of this version and plug-ins are not in it.
+    """
     portable = replace(task, root=task.root.resolve(), out=Path())
-    content = msgspec.json.encode({"version": __version__, "task": portable}, enc_hook=_as_text)
-    return hashlib.sha256(content).hexdigest()
+    models = [fingerprint_of(name) for name in checkpoints_of(task.config)]
+    inputs = {"version": __version__, "task": portable, "models": models}
+    return hashlib.sha256(msgspec.json.encode(inputs, enc_hook=_as_text)).hexdigest()
 
 
 def read_saved(folder: Path, expected: str) -> ScanOutcome | None:
@@ -479,7 +487,7 @@ def print_failures(console: Console, rows: Sequence[RowResult]) -> None:
             reasons.setdefault((row.name, reason), []).append(scan)
     for (name, reason), scans in reasons.items():
         text = f"{name}, {', '.join(scans)}: {reason}"
-        line = Text.assemble(("failed:", "red"), f" {visible(text)}")
+        line = Text.assemble(("failed:", "red"), f" {visible_lines(text)}")
         console.print(line, highlight=False, soft_wrap=True)
 
 

@@ -132,6 +132,8 @@ def take_first(waiting: dict[int, None], at_most: int | None) -> list[int]:
 
 # --- The messages of the nodes; only those of changed nodes are rebuilt.
 
+# The label of a node without a name that is probable enough.
+UNNAMED = "object"
 # Smaller turns of the estimated up direction change no box.
 MIN_TURN_RAD = math.radians(1.0)
 
@@ -146,7 +148,7 @@ class NodeStates:
     Args:
         graph: of the nodes.
         top_k: number of labels of each node.
-        even_gaussians: show the `even_moments` of a node's surface instead of the pooled Gaussian.
+        min_name: least probability of the label of a node; below it, its label is UNNAMED.
         boxes: of the nodes; None = around all of their points.
 
     Attributes:
@@ -158,14 +160,14 @@ class NodeStates:
         self,
         graph: GlobalGraph,
         top_k: int,
-        even_gaussians: bool,
+        min_name: float,
         boxes: NodeBoxes | None = None,
     ) -> None:
         self._boxes = NodeBoxes(graph.nodes) if boxes is None else boxes
         self.states: dict[int, wire.NodeState] = {}
         self._graph = graph
-        self._top_k = top_k
-        self._even_gaussians = even_gaussians
+        self._top_k, self._min_name = top_k, min_name
+        self._even_gaussians = graph.even_gaussians
         self._touched = graph.watch_nodes()
         # Confirmed nodes without a message.
         self._new: dict[int, None] = {}
@@ -272,13 +274,16 @@ class NodeStates:
             label = labels.get(node_id)
             if label is not None:
                 classes = Listed([wire.Belief(label, 1.0)], 0.0, 0.0)
+            best = classes.beliefs[0]
+            named = best.probability >= self._min_name
             extent = extents[node_id] if node_id in extents else self._known_extent(node_id)
             mean, covariance = pooled[:3], pooled[3:]
             if extent is not None and self._even_gaussians:
                 mean, covariance = extent.mean_m, extent.covariance_m2
             self.states[node_id] = wire.NodeState(
                 id=node_id,
-                label=classes.beliefs[0].label,
+                label=best.label if named else UNNAMED,
+                named=named,
                 classes=classes.beliefs,
                 remainder=classes.remainder,
                 mean_m=mean,

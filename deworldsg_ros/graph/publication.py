@@ -37,7 +37,8 @@ class Publication:
         edges: the messages of its edges by pair, kept up to date by
         refresh_edges: its argument says whether nothing may wait.
         boxes: of the nodes.
-        top_k: number of labels of each node.
+        top_k: number of labels of each node, and
+        min_name: least probability of its label; see `NodeStates`.
         include_surface_points: whether snapshots and updates contain surface points.
     """
 
@@ -49,13 +50,14 @@ class Publication:
         boxes: NodeBoxes,
         *,
         top_k: int,
+        min_name: float,
         include_surface_points: bool,
     ) -> None:
         self._graph = graph
         self._edges = edges
         self._refresh_edges = refresh_edges
         self._include_surface_points = include_surface_points
-        self._nodes = NodeStates(graph, top_k, graph.even_gaussians, boxes)
+        self._nodes = NodeStates(graph, top_k, min_name, boxes)
         # Frames to come may be older than the newest one of a map.
         self._stamp_ns = int(graph.nodes.last_seen_ns.max(initial=0))
         # Clients cannot use associations of frames that the graph has forgotten.

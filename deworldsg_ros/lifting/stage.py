@@ -65,7 +65,7 @@ POINT_AREA_M2 = 0.003
 LARGE_SURFACE_FACTOR = 4
 
 
-# --- Pixels of each object without depth refinement: the paper's ablations (a) and (b).
+# --- Pixels of each object without depth refinement: the paper's ablation (b).
 
 
 def mask_pixels(depth_m: Float32, runs: Int32) -> Pixels:
@@ -77,9 +77,7 @@ def mask_pixels(depth_m: Float32, runs: Int32) -> Pixels:
 
 
 def box_pixels(depth_m: Float32, box_xyxy: Float64) -> Pixels:
-    """Every valid pixel of an object's box: ablation (a).
-
-    Boxes may overlap; a pixel then belongs to several objects.
+    """Every valid pixel of a box. Boxes may overlap; a pixel then belongs to several objects.
 
     Args:
         depth_m: (H, W) float32 metres, 0 = invalid.
@@ -234,6 +232,65 @@ def _moments(
     return mean, covariance
 
 
+# --- A box by the one depth at its centre, as FROSS lifts it: the paper's ablation (a).
+
+
+def whole_box(box_xyxy: Float64) -> tuple[int, int, int, int]:
+    """Centre column, centre row, width and height of a box, truncated to whole pixels."""
+    x1, y1, x2, y2 = box_xyxy.tolist()
+    return int((x1 + x2) / 2), int((y1 + y2) / 2), int(x2 - x1), int(y2 - y1)
+
+
+def box_covariance(
+    u: int, v: int, width: int, height: int, depth_m: float, intrinsics: Intrinsics
+) -> Float64:
+    """Covariance of a box's object in the camera frame, (3, 3) square metres.
+
+    The box is a uniform distribution with covariance diag(w², h²) / 12. The pseudo-inverse of the
+    Jacobian of the projection, J = [[fx/Z, 0, -x fx/Z²], [0, fy/Z, -y fy/Z²]], maps it to 3D, with
+    x, y in normalised image coordinates as in the released code. The mean of the variances of x and
+    y is added to that of z.
+    """
+    x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
+    fx, fy = intrinsics.fx / depth_m, intrinsics.fy / depth_m
+    jacobian = np.array([[fx, 0.0, -x * fx / depth_m], [0.0, fy, -y * fy / depth_m]])
+    inverse = np.linalg.pinv(jacobian)
+    covariance = inverse @ np.diag([width**2 / 12.0, height**2 / 12.0]) @ inverse.T
+    covariance[2, 2] += (covariance[0, 0] + covariance[1, 1]) / 2
+    return np.asarray(covariance, np.float64)
+
+
+def box_estimate(
+    depth_m: Float32, box_xyxy: Float64, intrinsics: Intrinsics, surface_points: int
+) -> Estimate | None:
+    """An object by the depth at the centre of its box; None without a valid one.
+
+    The valid pixels of the central half of the box are its weight (`pixel_count`), and a sample of
+    them its points, as the evaluation points of FROSS. They do not enter the Gaussian.
+
+    Args:
+        depth_m: (H, W) float32 metres, 0 = invalid.
+        box_xyxy: (4,) pixels, inside the image.
+        intrinsics: of the depth image.
+        surface_points: size of the sample.
+    """
+    u, v, width, height = whole_box(box_xyxy)
+    if width < 1 or height < 1 or not depth_m[v, u] > 0:
+        return None
+    z = float(depth_m[v, u])
+    half_u, half_v = width // 4, height // 4
+    middle = np.array([u - half_u, v - half_v, u + half_u, v + half_v], np.float64)
+    pixels = box_pixels(depth_m, middle)
+    count = min(len(pixels), surface_points)
+    kept = np.arange(count) * len(pixels) // count
+    points = intrinsics.back_project(
+        pixels.columns[kept], pixels.rows[kept], pixels.depths_m[kept].astype(np.float64)
+    )
+    centre = intrinsics.back_project(np.array([u]), np.array([v]), np.array([z]))[0]
+    covariance = box_covariance(u, v, width, height, z, intrinsics)
+    return Estimate(len(pixels), centre, covariance, points)
+
+
 # --- The lifting stage: frame graph, instance image and depth become a local 3D graph.
 
 
@@ -300,8 +357,9 @@ class Lifting:
 
         Returns:
             The objects with enough valid pixels, in the order of the frame graph. Dropped objects
-            are counted in `drops` under ``few_mask_pixels``, ``few_spatial_inliers`` (Eq. 1) or
-            ``few_depth_inliers`` (Eq. 2). Their relations are removed.
+            are counted in `drops` under ``few_mask_pixels``, ``few_spatial_inliers`` (Eq. 1),
+            ``few_depth_inliers`` (Eq. 2) or, lifted by their boxes, ``no_centre_depth``. Their
+            relations are removed.
 
         Raises:
             RefusedInput: ``grid_mismatch`` if sizes differ, ``invalid_pose``, or
@@ -391,11 +449,12 @@ class Lifting:
     def _object(
         self, depth_m: Float32, runs: Int32, box_xyxy: Float64, intrinsics: Intrinsics
     ) -> Estimate | str:
-        """An object by the pixels of its mask or box; the reason if there are too few."""
+        """An object by the pixels of its mask, or by its box; the reason if there are too few."""
         config, constants = self._config, self._constants
         if config.pixels == "box":
-            pixels = box_pixels(depth_m, box_xyxy)
-        elif config.pixels == "mask":
+            of_box = box_estimate(depth_m, box_xyxy, intrinsics, constants.surface_points)
+            return of_box or "no_centre_depth"
+        if config.pixels == "mask":
             pixels = mask_pixels(depth_m, runs)
         else:
             pixels = spatial_inliers(depth_m, runs, config.tau, constants.epsilon_m)

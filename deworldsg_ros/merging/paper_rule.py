@@ -190,7 +190,7 @@ class PaperMerging:
         graph = GlobalGraph(Vocabulary(("class",), ("predicate",)), "world")
         observation = (np.zeros(3), np.eye(3), np.ones(1), 1, np.zeros((1, 3), np.float32))
         graph.observe(graph.add_node(*observation), *observation)
-        NodeStates(graph, 1, graph.even_gaussians).refresh()
+        NodeStates(graph, 1, 0.0).refresh()
 
     def merge(self, graph: GlobalGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.

@@ -64,7 +64,7 @@ class SurfaceMerging:
         for stamp_ns in range(1, 4):
             spare.merge(graph, _spare_frame(stamp_ns))
         boxes = NodeBoxes(graph.nodes, lambda slots: spare.shown(graph.nodes, slots))
-        NodeStates(graph, 1, graph.even_gaussians, boxes).refresh()
+        NodeStates(graph, 1, 0.0, boxes).refresh()
         spare.hidden(graph)
         spare._records.frames_before(np.zeros(3), np.zeros(3))
         parts = graph.nodes.slot(1), graph.nodes.slot(2)

@@ -97,6 +97,7 @@ def _node(item: SceneObject, colour: str, axes_of_view: Float64) -> dict[str, An
     return {
         "id": item.id,
         "label": item.label,
+        "named": item.is_named,
         "colour": colour,
         "looks": item.colour,
         "classes": [[belief.label, round(belief.probability, 3)] for belief in item.classes],

@@ -43,7 +43,7 @@ def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
         item = scene_object(node, graph.frame_id, up)
         table.add_row(
             _name(node.label, node.id, Style(color=colours[node.label])),
-            _percent(node.classes[0].probability) if node.classes else "",
+            _percent(node.classes[0].probability) if node.classes and node.named else "",
             " ".join(f"{value:6.2f}" for value in item.position_m),
             " × ".join(item.size_words),
             str(node.observations),

@@ -119,10 +119,9 @@ Vector3 = Annotated[
     list[Annotated[float, msgspec.Meta(ge=-MAX_GRAPH_COORDINATE_M, le=MAX_GRAPH_COORDINATE_M)]],
     msgspec.Meta(min_length=3, max_length=3),
 ]
-_AXES = "along the axes of the box; the third one is up"
 Size3 = Annotated[
     list[Annotated[float, msgspec.Meta(ge=0.0, le=2 * MAX_GRAPH_COORDINATE_M)]],
-    msgspec.Meta(min_length=3, max_length=3, description=_AXES),
+    msgspec.Meta(min_length=3, max_length=3, description="along the box's axes, the third is up"),
 ]
 Matrix3 = Annotated[
     list[Annotated[float, msgspec.Meta(ge=-MAX_GRAPH_VARIANCE_M2, le=MAX_GRAPH_VARIANCE_M2)]],
@@ -432,6 +431,9 @@ class NodeState(msgspec.Struct, frozen=True, gc=False):
         msgspec.Meta(description="operator = set by hand; absent = from the frames"),
     ] = msgspec.UNSET
     colour_lab: Colour = msgspec.UNSET
+    named: Annotated[
+        bool, msgspec.Meta(description="false = no class is probable enough: label is object")
+    ] = True
 
 
 class HiddenNode(msgspec.Struct, frozen=True):
@@ -633,10 +635,8 @@ def decode(text: Union[str, bytes], kind: type[M], most_bytes: Optional[int] = N
     """
     limit = max_bytes(kind) if most_bytes is None else most_bytes
     if len(text) > limit:
-        raise RefusedInput(
-            "message_too_large",
-            f"{kind.__name__} of {len(text)} bytes: expected at most {limit}",
-        )
+        seen = f"{kind.__name__} of {len(text)} bytes"
+        raise RefusedInput("message_too_large", f"{seen}: expected at most {limit}")
     try:
         message = msgspec.json.decode(text, type=kind)
     # UnicodeError: text that is no UTF-8. RecursionError: nested deeper than the interpreter.
@@ -696,5 +696,4 @@ def _check_once(name: str, items: list[Any]) -> None:
 
 def json_schema(kind: type[Message]) -> dict[str, Any]:
     """JSON Schema (2020-12) of a message."""
-    head = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    return {**head, **msgspec.json.schema(kind)}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | msgspec.json.schema(kind)

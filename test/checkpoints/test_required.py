@@ -1,10 +1,19 @@
 """Checkpoints that a configuration needs: what is missing is named before anything is loaded."""
 
+import json
+from pathlib import Path
+
 import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from deworldsg_ros.checkpoints.catalogue import detector_of, require_checkpoints, unused_detector
+from deworldsg_ros.checkpoints.catalogue import (
+    INDEX_FILE,
+    detector_of,
+    is_complete,
+    require_checkpoints,
+    unused_detector,
+)
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import Config, PerceptionConfig, load_config, to_mapping
 
@@ -82,6 +91,49 @@ def test_a_stronger_detector_that_lies_there_is_noticed(tmp_path):
     assert detector_of(tmp_path / "sam-vit-base") == "open_vocabulary"
     (tmp_path / "sam-vit-base" / "config.json").write_text("[1]")
     assert detector_of(tmp_path / "sam-vit-base") == detector_of(tmp_path) == "transformers"
+
+
+def test_a_folder_with_some_of_its_shards_is_not_complete(tmp_path):
+    shards = [f"model-0000{number}-of-00004.safetensors" for number in (1, 2, 3, 4)]
+    index = {"weight_map": {f"layer.{number}": name for number, name in enumerate(shards)}}
+    found = []
+    for name, text in (
+        *(("config.json", "{}"), (shards[0], ""), (INDEX_FILE, json.dumps(index))),
+        *((shard, "") for shard in shards[1:]),
+    ):
+        (tmp_path / name).write_text(text)
+        found.append(is_complete(tmp_path))
+    assert found == [False] * 5 + [True]
+    (tmp_path / INDEX_FILE).write_text("[]")
+    assert not is_complete(tmp_path)
+    (tmp_path / "model.safetensors").write_text("")
+    assert is_complete(tmp_path)
+
+
+def test_weights_in_the_layout_of_their_authors_are_named_with_the_way_out(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    weights = tmp_path / "models" / "sam2.1_hiera_base_plus.pt"
+    weights.parent.mkdir()
+    weights.write_bytes(b"")
+    for path, model in (
+        ("models/sam2.1_hiera_base_plus.pt", "sam2.1-hiera-base-plus"),  # not an id of the hub
+        ("./models/sam2.1_hiera_base_plus.pt", "sam2.1-hiera-base-plus"),
+        ("models", "sam2.1-hiera-tiny"),
+    ):
+        with pytest.raises(Exception, match="its authors' own layout") as error:
+            require_checkpoints(PerceptionConfig(segmenter="sam2", segmenter_path=path))
+        assert f"models get {model}" in str(error.value)
+        assert str(error.value).endswith(f"set the option to {Path(path).parent / model}")
+    (weights.parent / "config.json").write_text("{}")
+    require_checkpoints(PerceptionConfig(segmenter="sam2", segmenter_path="models"))
+
+
+def test_a_probe_of_dinov2_is_trained_and_not_imported(root_dir):
+    config = load_config(root_dir / "config" / "paper.yaml")
+    relations = msgspec.structs.replace(config.relations, world_model="dinov2")
+    with pytest.raises(Exception, match="train-probe CLIPS --world-model dinov2") as error:
+        require_checkpoints(relations=relations)
+    assert "import-probe" not in str(error.value)
 
 
 def test_a_detector_of_free_text_is_measured_with_words(root_dir, tmp_path):

@@ -1,6 +1,7 @@
 """`deworldsg models get`, `list` and `inspect`, against a hub on this machine."""
 
 import hashlib
+import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from deworldsg_ros.checkpoints.catalogue import CATALOGUE, GROUPS  # noqa: E402 
 from deworldsg_ros.checkpoints.hub import read_headers  # noqa: E402
 from deworldsg_ros.cli.demo import configuration_of  # noqa: E402
 from deworldsg_ros.config import load_config  # noqa: E402
+from deworldsg_ros.evaluation.rows import DINOV2  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 
 pytestmark = pytest.mark.models
@@ -52,15 +54,53 @@ def test_a_model_is_fetched_verified_listed_and_kept(hub, tmp_path):
             assert not (folder / name).exists()
         else:
             assert (folder / name).read_bytes() == content
-    subprocess.run(["sha256sum", "-c", "SHA256SUMS"], cwd=folder, check=True)
-    assert len((folder / "SHA256SUMS").read_text().splitlines()) == 4
+    subprocess.run(["sha256sum", "-c", "dinov2-small.sha256"], cwd=tmp_path, check=True)
+    first, *lines = (tmp_path / "dinov2-small.sha256").read_text().splitlines()
+    assert first == f"# facebook/dinov2-small {COMMIT}" and len(lines) == 4
     listed = printed("models", "list", "--into", tmp_path)
     assert "there      dinov2-small" in listed and "missing    sam2.1-hiera-tiny" in listed
+    assert "licence apache-2.0; 0.48 MB here" in listed
     for words in ("sha256sum -c", "import-fross", "import-probe", "licence mit"):
         assert words in listed
+
+
+def test_a_folder_that_is_complete_needs_no_network(hub, tmp_path, monkeypatch):
+    get(tmp_path)
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    assert "complete, and as" in get(tmp_path)
+    assert "complete, and as" in get(tmp_path, "facebook/dinov2-small")
+    lock, folder = tmp_path / "dinov2-small.sha256", tmp_path / "dinov2-small"
+    kept = lock.read_text()
+    lock.unlink()
+    assert "complete, and not verified: no " in get(tmp_path)
+    lock.write_text(kept.replace("#", "", 1))
+    assert "expected '# OWNER/NAME COMMIT'" in refusal(
+        "models", "get", "dinov2-small", "--into", tmp_path
+    )
+    # A file that is not as the first download brought it is not taken for it.
+    lock.write_text(kept)
+    (folder / "config.json").write_bytes(b"{}")
+    assert "cannot be fetched" in refusal("models", "get", "dinov2-small", "--into", tmp_path)
+    monkeypatch.setenv("HF_ENDPOINT", hub.url)
     hub.requested.clear()
-    assert "was there" in get(tmp_path, "facebook/dinov2-small")
-    assert hub.requested == []
+    get(tmp_path)
+    assert {name for _, name, _ in hub.requested} == {"config.json"}
+    assert (folder / "config.json").read_bytes() == FILES["config.json"]
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "config.json"])
+def test_later_downloads_bring_what_the_first_one_brought(hub, tmp_path, name):
+    """Also where the hub itself names the sum of another content, at the same commit."""
+    get(tmp_path)
+    shutil.rmtree(tmp_path / "dinov2-small")
+    hub.files[name] = b"{}" if name == "config.json" else safetensors.save({"a": np.ones(2)})
+    refused = refusal("models", "get", "dinov2-small", "--into", tmp_path)
+    lock = tmp_path / "dinov2-small.sha256"
+    assert f"{name} has sha256:" in refused and f"{lock} expects" in refused
+    assert not (tmp_path / "dinov2-small" / name).exists()
+    lock.unlink()
+    get(tmp_path)
+    assert hashlib.sha256(hub.files[name]).hexdigest() in lock.read_text()
 
 
 def test_a_download_that_was_cut_continues_where_it_stopped(hub, tmp_path):
@@ -93,13 +133,22 @@ def test_a_pinned_entry_is_fetched_and_another_content_refused(hub, tmp_path, mo
     digest = hashlib.sha256(WEIGHTS).hexdigest()
     pinned = replace(CATALOGUE["dinov2-small"], revision=COMMIT, sha256=digest)
     monkeypatch.setitem(CATALOGUE, "dinov2-small", pinned)
-    assert "licence apache-2.0; commit 0123456789ab" in get(tmp_path)
-    assert f"{digest}  model.safetensors" in (tmp_path / "dinov2-small/SHA256SUMS").read_text()
-    hub.files["model.safetensors"] = safetensors.save({"layer.weight": np.ones(2, np.float32)})
+    assert "licence apache-2.0; commit 0123456789ab and SHA-256" in get(tmp_path)
+    # A lock of other weights than the catalogue now has counts for nothing.
+    other = safetensors.save({"layer.weight": np.ones(2, np.float32)})
+    hub.files["model.safetensors"] = other
+    lock = tmp_path / "dinov2-small.sha256"
+    lock.write_text(lock.read_text().replace(digest, hashlib.sha256(other).hexdigest()))
     hub.requested.clear()
     refused = refusal("models", "get", "dinov2-small", "--into", tmp_path)
     assert f"the catalogue expects sha256:{digest}" in refused and hub.requested == []
     assert (tmp_path / "dinov2-small/model.safetensors").read_bytes() == WEIGHTS
+    lock.unlink()
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    assert "verified by the SHA-256 of its weights" in get(tmp_path)
+    (tmp_path / "dinov2-small/model.safetensors").write_bytes(other)
+    assert "cannot be fetched" in refusal("models", "get", "dinov2-small", "--into", tmp_path)
+    monkeypatch.setenv("HF_ENDPOINT", hub.url)
     other = replace(pinned, revision="f" * 40)
     monkeypatch.setitem(CATALOGUE, "dinov2-small", other)
     assert "cannot be fetched" in refusal("models", "get", "dinov2-small", "--into", tmp_path)
@@ -109,9 +158,11 @@ def test_the_catalogue_says_what_a_model_is(tmp_path):
     listed = printed("models", "list", "--into", tmp_path)
     for words in (
         "dfine-small-obj2coco: perception.detector: transformers; 80 classes, AP 50.7 on COCO; 10 "
-        "million parameters; licence apache-2.0",
+        "million parameters, about 40 MB; licence apache-2.0",
         "grounding-dino-tiny: perception.detector: open_vocabulary; free text, AP 48.4",
-        "172 million parameters; licence apache-2.0; commit a2bb814dd30d",
+        "172 million parameters, about 688 MB; licence apache-2.0; commit a2bb814dd30d and SHA-256",
+        "vjepa2-vitg-fpc64-384: relations.world_model: vjepa2, of the paper; 1034.6 million "
+        "parameters, about 4.14 GB; licence mit",
     ):
         assert words in listed
     for model in CATALOGUE.values():
@@ -137,7 +188,9 @@ def test_the_groups_are_the_models_of_their_configurations(root_dir, tmp_path, m
     paper = root_dir / "config" / "paper.yaml"
     config = load_config(paper)
     paths = {config.perception.segmenter_path, config.relations.world_model_path}
-    assert paths == {f"./models/{name}" for name in GROUPS["paper"]}
+    wanted = {f"./models/{name}" for name in GROUPS["paper"]}
+    (of_row_d,) = wanted - paths
+    assert paths < wanted and f"relations.world_model_path={of_row_d}" in DINOV2
     assert set(GROUPS["paper"]) <= CATALOGUE.keys()
     assert configuration_of("embedded", None) is None
     assert configuration_of("paper", None) == paper

@@ -68,7 +68,7 @@ def test_the_paper_runs_with_models_of_a_hub_and_on_a_machine_without_network(
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     shutil.copytree(here / "models", robot / "models")
     for name in ("sam2.1-hiera-tiny", "vjepa2-vitg-fpc64-384"):
-        subprocess.run(["sha256sum", "-c", "SHA256SUMS"], cwd=robot / "models" / name, check=True)
+        subprocess.run(["sha256sum", "-c", f"{name}.sha256"], cwd=robot / "models", check=True)
     monkeypatch.chdir(robot)
     assert run_paper(root_dir, "out").exit_code == 0
     copied = json.loads((robot / "out" / "scene_graph.json").read_text())

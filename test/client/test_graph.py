@@ -13,6 +13,7 @@ from support.view import box_at, make_edge, make_graph, make_node
 
 from deworldsg_ros.client import ClientError, SceneGraph
 from deworldsg_ros.client.boxes import gap_m
+from deworldsg_ros.client.explain import explain_object
 from deworldsg_ros.client.graph import _fits, distance_m
 from deworldsg_ros.client.meanings import is_class
 from deworldsg_ros.client.questions import ask
@@ -48,6 +49,20 @@ def test_an_empty_graph_answers_nothing():
         graph.one("cup")
     with pytest.raises(ClientError, match="near"):
         graph.objects(within=1.0)
+
+
+def test_an_object_without_a_name(small):
+    cup = msgspec.structs.replace(small[1].state, label="object", named=False)
+    cup = msgspec.structs.replace(cup, existence=0.9, classes=[wire.Belief("cup", 0.4)])
+    graph = SceneGraph(make_graph([cup, small[2].state], [make_edge(1, 2, "on", 0.9)]))
+    item = graph[1]
+    assert (item.name, item.is_named, item.probability) == ("object #1", False, 0.9)
+    assert item.probability_of("cup") == pytest.approx(0.36)
+    assert ids(graph.objects("cup")) == [] and ids(graph.objects("object")) == [1]
+    found = ask(graph, "what is on the table").found
+    assert ids(graph.on("table")) == ids(answer.item for answer in found) == [1]
+    said = str(explain_object(item, graph.relations(1)))
+    assert "no class is probable enough for a name: cup 40%; all others 60%" in said
 
 
 def test_relations_from_both_ends_and_paths(small):

@@ -13,6 +13,7 @@ from deworldsg_ros.evaluation.baselines import (
     Fross,
     Kim,
 )
+from deworldsg_ros.lifting.stage import box_covariance
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import EvaluationError, RefusedInput
@@ -67,7 +68,7 @@ def test_fross_lifts_the_centre_of_the_box():
     inverse = np.linalg.pinv([[500 / 3, 0, -x * 500 / 9], [0, 500 / 3, -y * 500 / 9]])
     expected = inverse @ np.diag([40**2 / 12, 200**2 / 12]) @ inverse.T
     expected[2, 2] += (expected[0, 0] + expected[1, 1]) / 2
-    found = baselines.box_covariance(600, 30, 40, 200, 3.0, CAMERA)
+    found = box_covariance(600, 30, 40, 200, 3.0, CAMERA)
     np.testing.assert_allclose(found, expected, atol=1e-12)
     T = np.eye(4)
     T[:3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]

@@ -83,6 +83,11 @@ def test_labels_of_a_detector_become_classes(root, tmp_path):
     evaluate_scan(task(root, tmp_path / "out"))
     graph = read_graph(tmp_path / "out" / "room_0")
     assert translate(graph, annotations).nodes is graph.nodes
+    # A node without a name counts with its best guess.
+    guess = graph.nodes[0].label
+    unnamed = msgspec.structs.replace(graph.nodes[0], label="object", named=False)
+    unnamed_graph = msgspec.structs.replace(graph, nodes=[unnamed], edges=[])
+    assert translate(unnamed_graph, annotations).nodes[0].label == guess
     beliefs = [Belief("couch", 0.3), Belief("mat", 0.3), Belief("stool", 0.2), Belief("book", 0.1)]
     node = msgspec.structs.replace(graph.nodes[0], classes=beliefs, label="couch")
     foreign = msgspec.structs.replace(graph, nodes=[node], edges=[])

@@ -15,7 +15,7 @@ from support.sequences import write_room
 
 from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard, write_probe_card
 from deworldsg_ros.cli.configuration import effective_config
-from deworldsg_ros.config import Config, MergingConfig, load_config
+from deworldsg_ros.config import Config, MergingConfig, RelationsConfig, load_config
 from deworldsg_ros.evaluation import tables
 from deworldsg_ros.evaluation.front_ends import POSE_KINDS, FrontEndChoice, PoseSource, repose
 from deworldsg_ros.evaluation.predictions import ScanPrediction
@@ -99,6 +99,30 @@ def test_the_fingerprint_depends_on_the_inputs_and_not_on_the_folder(root, tmp_p
     known = tables.fingerprint(job(root, tmp_path).task)
     assert tables.fingerprint(job(root, tmp_path / "elsewhere").task) == known
     assert tables.fingerprint(job(root, tmp_path, **changes).task) != known
+
+
+def test_weights_that_were_replaced_at_their_path_are_another_input(root, tmp_path, monkeypatch):
+    folder = tmp_path / "probe"
+    config = msgspec.structs.replace(Config(), relations=RelationsConfig(probe_path=str(folder)))
+    one = job(root, tmp_path / "out", config=config)
+
+    def reused(write):
+        write()
+        return run_job(one).reused
+
+    def weights(content, name="model.safetensors"):
+        folder.mkdir(exist_ok=True)
+        (folder / name).write_bytes(content)
+        os.utime(folder / name, ns=(0, 0))  # as a copy that keeps the time
+
+    assert [reused(lambda: None), reused(lambda: weights(b"one"))] == [False, False]
+    assert [reused(lambda: weights(b"one")), reused(lambda: weights(b"two"))] == [True, False]
+    assert not reused(lambda: weights(b"{}", "config.json"))
+    assert reused(lambda: (folder / ".cache").mkdir())
+    # Weights that are replaced during a run did not make its result.
+    outcome = run_job(one).outcome
+    monkeypatch.setattr(tables, "evaluate_scan", lambda task: weights(b"new") or outcome)
+    assert [reused(lambda: weights(b"old")), reused(lambda: None)] == [False, False]
 
 
 class Deadly:

@@ -84,8 +84,18 @@ def test_the_message_of_a_node(points: np.ndarray) -> None:
     assert b"surface_points_m" not in msgspec.json.encode(state)
 
 
+def test_a_node_without_a_probable_name_is_an_object(points: np.ndarray) -> None:
+    graph = graph_of_one(points)
+    for min_name, label in ((0.5, "cup"), (0.51, "object")):
+        states = NodeStates(graph, 2, min_name)
+        states.refresh()
+        state = states.states[1]
+        assert (state.label, state.named) == (label, label == "cup")
+        assert state.classes[0] == wire.Belief("cup", 0.5)
+
+
 def test_only_a_real_turn_of_up_makes_new_boxes(points: np.ndarray) -> None:
-    states = NodeStates(graph_of_one(points), 2, even_gaussians=False)
+    states = NodeStates(graph_of_one(points), 2, 0.0)
     assert states.refresh() == [1]
     before = states.states[1]
     states.set_up(np.array([0.0, 0.01, 0.99995]))

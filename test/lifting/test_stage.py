@@ -14,6 +14,7 @@ from support.merging import random_pose
 from support.reference_lifting import reference_lift
 
 from deworldsg_ros.config import LiftingConfig
+from deworldsg_ros.evaluation.baselines import Fross
 from deworldsg_ros.lifting import Lifting, refine, stage
 from deworldsg_ros.lifting.stage import LiftingConstants, box_pixels
 from deworldsg_ros.scene.camera import Intrinsics
@@ -203,7 +204,7 @@ def test_inputs_of_another_size_or_range_are_refused(position, wrong, reason):
     [
         ("refined", 99 - 4, 1.0),  # without the flying pixel and the mask's corners
         ("mask", 100, 1.01),
-        ("box", 14 * 14, (99 + 2 + 96 * 3) / 196),  # with the wall
+        ("box", 7 * 7, 2.0),  # of the central half, and the depth of the pixel at the centre
     ],
 )
 def test_masks_and_boxes_without_refinement(pixels, count, depth_m):
@@ -212,9 +213,34 @@ def test_masks_and_boxes_without_refinement(pixels, count, depth_m):
     instances[10:20, 10:20] = 1
     depths_m = np.where(instances, 1.0, 3.0)
     depths_m[15, 15] = 2.0
-    lifted = lift(scene_of(instances, depths_m), 1, boxes=[8, 8, 21, 21], pixels=pixels)
+    boxes = [[8, 8, 22, 22]]
+    lifted = lift(scene_of(instances, depths_m), 1, boxes=boxes, pixels=pixels)
     assert lifted.pixel_counts.tolist() == [count]
     assert lifted.depths_m[0] == pytest.approx(depth_m)
+
+
+def test_a_box_is_lifted_by_one_depth_as_fross_does():
+    _, depth_m, camera, T = make_scene(2)
+    none = np.zeros(depth_m.shape, np.uint16)
+    corners = [[3, 2, 70, 50], [22, 11, 41, 59], [0, 0, 9, 9], [5, 5, 5.5, 50], [40, 30, 60, 50]]
+    boxes = np.array(corners)
+    depth_m[40, 50] = np.nan
+    lifted = lift((none, depth_m, camera, T), 5, boxes=boxes, pixels="box")
+    graph = frame_graph(5, depth_m.shape, boxes=boxes)
+    fross = Fross().lift(graph, None, depth_m, camera, T)
+    assert (lifted.instance_ids - 1).tolist() == fross.rows == [0, 1, 2]
+    assert lifted.drops == {"no_centre_depth": 2}
+    for row, node in enumerate(fross.nodes):
+        np.testing.assert_allclose(lifted.means_world[row], node.mean_world)
+        ridge = LiftingConfig().covariance_ridge_m2 * np.eye(3)
+        np.testing.assert_allclose(lifted.covariances_world[row], node.covariance_world + ridge)
+    # What does not lie at the centre of a box has no influence on its Gaussian.
+    u, v = 36, 26
+    others = np.full_like(depth_m, 9.0)
+    others[v, u] = depth_m[v, u]
+    again = lift((none, others, camera, T), 1, boxes=boxes[:1], pixels="box")
+    np.testing.assert_array_equal(again.covariances_world, lifted.covariances_world[:1])
+    assert again.surface_points_world[0].shape == (200, 3)
 
 
 def test_boxes_may_overlap_leave_the_image_and_have_no_depth():
@@ -228,7 +254,8 @@ def test_boxes_may_overlap_leave_the_image_and_have_no_depth():
     for boxes, pixels in (([], "box"), ([[0, 0, 20, 20]], "box"), ([[0, 0, 20, 20]], "refined")):
         lifted = lift(blind, len(boxes), boxes=boxes, pixels=pixels)
         assert (lifted.means_world.shape, lifted.covariances_world.shape) == ((0, 3), (0, 3, 3))
-        assert lifted.drops == ({"few_mask_pixels": 1} if boxes else {})
+        reason = "no_centre_depth" if pixels == "box" else "few_mask_pixels"
+        assert lifted.drops == ({reason: 1} if boxes else {})
 
 
 def test_warm_up_compiles_everything_that_a_frame_needs():

@@ -24,7 +24,7 @@ def node_states(
     graph: GlobalGraph, top_k: int, with_points: bool = False
 ) -> dict[int, wire.NodeState]:
     """Messages of the confirmed nodes by ascending id, as a publication makes them."""
-    states = NodeStates(graph, top_k, graph.even_gaussians)
+    states = NodeStates(graph, top_k, 0.0)
     states.refresh()
     known = dict(sorted(states.states.items()))
     return {i: states.with_points(known[i]) for i in known} if with_points else known

@@ -26,7 +26,8 @@ let chosen = null;  // id of the object that was clicked
 let pointed = null;  // id of the object under the pointer
 
 const isOf = (edge, id) => edge.subject === id || edge.object === id;
-const belief = node => (node.existence ?? 1) * (node.classes.length ? node.classes[0][1] : 1);
+const belief = node =>
+  (node.existence ?? 1) * (node.named && node.classes.length ? node.classes[0][1] : 1);
 const showsNode = node => !hiddenClasses.has(node.label) && belief(node) >= least.object;
 const showsEdge = edge => !hiddenPredicates.has(edge.predicate) &&
   edge.probability >= least.relation &&
@@ -265,7 +266,7 @@ function showCard(id) {
     .map(([label, p]) => `${label} ${percent(p)}`);
   if (node.other >= 0.01) classes.push(`others ${percent(node.other)}`);
   for (const [term, text] of [
-    ["class", classes.join(", ")],
+    ["class", (node.named ? "" : "perhaps ") + classes.join(", ")],
     ["is an object", node.existence === null ? null : percent(node.existence)],
     ["size", `${node.sizeWords.join(" × ")} cm`],
     ["colour", node.looks],

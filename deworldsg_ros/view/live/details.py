@@ -23,6 +23,8 @@ def in_words(item: SceneObject) -> str:
     if not item.classes:
         return item.label
     first = item.classes[0]
+    if not item.is_named:
+        return f"something, perhaps {_article(first.label)} {first.label}"
     others = [c for c in item.classes[1:] if c.probability >= PERHAPS * first.probability]
     likely = [c.label for c in others if c.probability >= AS_LIKELY * first.probability]
     if likely:
