@@ -29,6 +29,9 @@ RECORDING = "bags/demo_room --layout recording"
 SIMULATED = "SIMULATED --layout replica"
 NEW = "NEW --layout replica --scan phys_000 --scan phys_001 --scan phys_002 --scan phys_003"
 FAULTS = "--flip 0.1 --miss 0.1 --jitter 2"
+ALL_PAIRS = "--set paper_rules:relations.edge_belief=all_pairs"
+# Ridges of Eq. 4, square metres. The configurations have 1.0e-6.
+RIDGES = ("1.0e-8", "1.0e-5", "1.0e-4", "1.0e-3")
 # Arguments of `deworldsg evaluate table`, by the name of the run; the most important first.
 RUNS = {
     "rooms": f"main {ROOMS} --front-end recorded",
@@ -48,7 +51,15 @@ RUNS = {
     "new_boxes": f"main {NEW} --front-end boxes",
     "new_embedded": f"main {NEW} --front-end backend",
     "simulated_faults": f"hard {SIMULATED} --front-end ground-truth",
+    "rooms_all_pairs": f"main {ROOMS} --front-end recorded {ALL_PAIRS}",
+    "rooms_boxes_all_pairs": f"main {ROOMS} --front-end boxes {ALL_PAIRS}",
+    "recording_embedded_all_pairs": f"main {RECORDING} --front-end backend {ALL_PAIRS}",
 }
+for ridge in RIDGES:
+    change = f"--set lifting.covariance_ridge_m2={ridge}"
+    RUNS[f"rooms_{ridge}"] = f"main {ROOMS} --front-end recorded {change}"
+    RUNS[f"recording_{ridge}"] = f"main {RECORDING} --front-end backend {change}"
+
 # The runs of each table with the name of their input. A run of several inputs names them itself.
 TABLES = {
     "new rooms": {"new_boxes": "true boxes", "new_embedded": "embedded"},
@@ -70,7 +81,22 @@ TABLES = {
     "simulated faults": {"simulated_faults": ""},
     "ablation": {"ablation": "right labels"},
     "predicates": {"rooms_boxes": "rendered", "simulated_boxes": "simulated"},
+    "pairs": {
+        "rooms": "recorded, pairs of Eq. 8",
+        "rooms_all_pairs": "recorded, all pairs",
+        "rooms_boxes": "true boxes, pairs of Eq. 8",
+        "rooms_boxes_all_pairs": "true boxes, all pairs",
+        "recording_embedded": "recording, pairs of Eq. 8",
+        "recording_embedded_all_pairs": "recording, all pairs",
+    },
+    "ridge": {
+        name if ridge == "1.0e-6" else f"{what}_{ridge}": f"{what}, {ridge} m²"
+        for what, name in (("rooms", "rooms"), ("recording", "recording_embedded"))
+        for ridge in sorted((*RIDGES, "1.0e-6"), key=float)
+    },
 }
+# Tables of one method.
+ONLY = {"pairs": ("paper_rules",), "ridge": ("paper_rules",)}
 # The name of a row is METHOD or METHOD-INPUT.
 METHODS = {
     "fross": "FROSS",
@@ -98,6 +124,7 @@ COLUMNS = (
     ("Rel.", "relationship_recall", 100, 1),
     ("Obj.", "object_recall", 100, 1),
     ("Pred.", "predicate_recall", 100, 1),
+    ("of det.", "predicate_recall_of_detected", 100, 1),
     ("nodes", "nodes", 1, 0),
     ("found", "found", 1, 0),
     ("dup.", "duplicates", 1, 0),
@@ -160,7 +187,7 @@ def table(name: str, reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
     for run_name, input_name in TABLES[name].items():
         for row in reports[run_name]["rows"]:
             method, _, condition = row["name"].partition("-")
-            if method in METHODS:
+            if method in ONLY.get(name, METHODS):
                 what = input_name or INPUTS[condition]
                 rows.append([what, METHODS[method], *cells_of(row)])
     return markdown(["input", "method", *(heading for heading, *_ in COLUMNS)], rows)

@@ -181,11 +181,12 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 1.0
     fusion_alpha: Annotated[float, option("weight of the prior, Eq. 10", ge=0, le=100)] = 0.5
     edge_belief: Annotated[
-        Literal["paper", "robust"],
+        Literal["paper", "all_pairs", "robust"],
         option(
             "meaning of the probability of an edge: paper = which predicate, from the sum of "
-            "logits, each direction separately (Eq. 9); robust = whether the relation holds, from "
-            "frames, fused geometry and the prior; an object has one support"
+            "logits, each direction separately (Eq. 9), of frames in which the two are a neighbour "
+            "pair (Eq. 8); all_pairs = the same, of all frames; robust = whether the relation "
+            "holds, from frames, fused geometry and the prior; an object has one support"
         ),
     ] = "robust"
     max_clips_per_s: Annotated[

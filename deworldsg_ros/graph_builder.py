@@ -21,7 +21,7 @@ from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.poses.drift import Drift
 from deworldsg_ros.relations import beliefs
 from deworldsg_ros.relations.beliefs import EdgeBeliefs
-from deworldsg_ros.relations.paper import ClassPairPrior
+from deworldsg_ros.relations.paper import ClassPairPrior, candidates
 from deworldsg_ros.scene.arrays import Float64, softmax_weights
 from deworldsg_ros.scene.camera import UpEstimator, check_pose, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
@@ -64,6 +64,7 @@ class GraphBuilder:
         if prior is None:
             prior = ClassPairPrior(len(vocabulary.classes), len(vocabulary.predicates))
         output = config.output
+        self._relations = config.relations
         self.graph = graph
         self.merging = build_merging(config.merging, output.min_existence)
         # The paper takes poses as they are, and has no boxes.
@@ -109,8 +110,9 @@ class GraphBuilder:
         return dict(Counter(self.merging.hidden(self.graph).values()))
 
     def configure(self, config: Config) -> None:
-        """Use other thresholds of the section ``merging`` from the next frame on."""
+        """Use other thresholds of the sections ``merging`` and ``relations`` from now on."""
         self.merging.configure(config.merging)
+        self._relations = config.relations
 
     def integrate(self, local: LocalGraph) -> list[int]:
         """Merge a frame's local graph; returns the node id of each of its rows.
@@ -127,7 +129,7 @@ class GraphBuilder:
                 "out_of_order",
                 f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",
             )
-        local = self.graph.admit(local)
+        local = candidates(self.graph.admit(local), self._relations)
         if self._drift is not None:
             local = self._drift.align(local)
         logits = local.relations.logits

@@ -143,6 +143,9 @@ def test_the_largest_sums_of_logits_are_published_and_saved(config: Config, tmp_
     builder, replica = GraphBuilder(config, VOCABULARY, "map"), GraphReplica()
     rng = np.random.default_rng(3)
     local = next(one for one in (hostile_local_graph(rng, 1) for _ in range(50)) if len(one) >= 2)
+    # In one place of the image: a neighbour pair, as the paper asks for.
+    boxes, depths_m = np.tile(local.boxes_xyxy[:1], (len(local), 1)), np.ones(len(local))
+    local = replace(local, boxes_xyxy=boxes, depths_m=depths_m)
     pairs = np.tile([[0, 1]], (limits.MAX_RELATIONS, 1))
     logits = np.tile(np.array([1.0, -1.0, 1.0]) * limits.MAX_LOGIT, (len(pairs), 1))
     relations = Relations(pairs, logits, np.ones(len(pairs)))

@@ -46,6 +46,7 @@ from deworldsg_ros.evaluation.reports import (
 from deworldsg_ros.evaluation.rows import (
     Configurations,
     Row,
+    paper_file,
     table_rows,
 )
 from deworldsg_ros.evaluation.runner import ScanOutcome, ScanTask, evaluate_scan
@@ -292,9 +293,11 @@ def make_table(
         )
     tasks = scan_tasks(annotations, data, detections, running, scoring, out)
     front_end = tasks[0].front_end
+    paper = paper_file(annotations.layout.name)
     configurations = Configurations(
         partial(_configure, kind, running),
-        load_config(_config_path("paper", None)),
+        paper,
+        load_config(_config_path(paper, None)),
         running.config.stem if running.config else "default",
     )
     rows = table_rows(kind, poses, front_end, configurations)

@@ -158,13 +158,14 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
 
 
 def print_protocol(console: Console, result: ProtocolResult, title: str) -> None:
-    """Print the five scores, the scores by class, and the notes."""
+    """Print the official scores, the scores by class, and the notes."""
     table = Table(title=Text(visible(title)))
     for heading in ("recall at 1, %", "items", "right", "recall", "mean over classes"):
         table.add_column(heading, justify="left" if heading.startswith("recall at") else "right")
     rows = (
         ("objects", result.objects, percent(result.object_mean_recall)),
         ("predicates", result.predicates, percent(result.predicate_mean_recall)),
+        ("of detected pairs", result.predicates_of_detected, ""),
         ("relationships", result.relationships, ""),
     )
     for name, count, mean in rows:
@@ -520,6 +521,7 @@ def protocol_values(result: ProtocolResult) -> dict[str, Any]:
         "counts": {
             "object": _count_values(result.objects),
             "predicate": _count_values(result.predicates),
+            "predicate_of_detected": _count_values(result.predicates_of_detected),
             "relationship": _count_values(result.relationships),
         },
         "object_per_class": _class_values(result.object_classes),

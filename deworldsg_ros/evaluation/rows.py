@@ -75,7 +75,7 @@ def runs_the_paper(
         method: the pipeline, or a baseline.
         config: configuration of the row.
         front_end: source of its detections.
-        paper: content of config/paper.yaml.
+        paper: the paper's configuration for the data set.
         settings: ``section.field=text`` of a step of the ablation, on top of `paper`.
     """
     if front_end.kind != "backend":
@@ -267,9 +267,9 @@ class Condition:
         return replace(front_end, faults=faults, flip=flip)
 
 
-# name, title, method, configuration file, row of the paper. The file `rules` is config/paper.yaml
-# if its checkpoints are there and detections are not given, else config/paper_rules.yaml. The
-# title of the last row is the name of its configuration.
+# name, title, method, configuration file, row of the paper. The file `rules` is that of
+# `paper_file` if its checkpoints are there and detections are not given, else
+# config/paper_rules.yaml. The title of the last row is the name of its configuration.
 METHODS = (
     ("fross", "FROSS (own code)", "fross", "rules", "FROSS"),
     ("kim", "Kim et al. (own code)", "kim", "rules", "Kim et al."),
@@ -335,27 +335,34 @@ SWITCH_CONDITIONS = (
 )
 
 
+def paper_file(layout: str) -> str:
+    """The file with the paper's networks for the names of a layout: of 3DSSG or Visual Genome."""
+    return "paper" if layout == "3rscan" else "paper_replica"
+
+
 @dataclass(frozen=True)
 class Configurations:
     """The configurations of the rows.
 
     Attributes:
         configure: returns the configuration of a row.
-        paper: content of config/paper.yaml, unchanged by the command line.
+        paper_file: the paper's file for the data set, see `paper_file`.
+        paper: its content, unchanged by the command line.
         name: name of the configuration of the row `default`.
     """
 
     configure: Configure
+    paper_file: str
     paper: Config
     name: str = "default"
 
     def rules(self, front_end: FrontEndChoice, table: str) -> str:
         """The file with the paper's rules: with its networks, if they can run."""
-        config = self.configure("paper", (), "paper")
+        config = self.configure(self.paper_file, (), self.paper_file)
         missing = missing_perception(config.perception)
         if table != "ablation":  # its first rows need no world model
             missing += missing_world_model(config.relations)
-        return "paper_rules" if missing or front_end.kind != "backend" else "paper"
+        return "paper_rules" if missing or front_end.kind != "backend" else self.paper_file
 
 
 def table_rows(

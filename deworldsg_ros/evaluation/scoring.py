@@ -241,6 +241,8 @@ class ProtocolResult:
 
     Attributes:
         objects, predicates, relationships: counts over all scans.
+        predicates_of_detected: the predicates whose objects both have a matched node: "among
+            detected object pairs", the definition of the paper.
         object_classes, predicate_classes: counts by annotated class or predicate, in the order of
             the vocabulary; without those that have no item.
         scans: results of the scans, in the order of the split.
@@ -249,6 +251,7 @@ class ProtocolResult:
     objects: Count
     predicates: Count
     relationships: Count
+    predicates_of_detected: Count
     object_classes: dict[str, Count]
     predicate_classes: dict[str, Count]
     scans: list[ScanResult]
@@ -269,10 +272,11 @@ class ProtocolResult:
         return [note for scan in self.scans for note in scan.notes]
 
     def numbers(self) -> dict[str, float]:
-        """The five scores by name, as fractions."""
+        """The five scores, and the predicate recall as the paper defines it, as fractions."""
         return {
             "object_recall": self.objects.recall,
             "predicate_recall": self.predicates.recall,
+            "predicate_recall_of_detected": self.predicates_of_detected.recall,
             "relationship_recall": self.relationships.recall,
             "object_mean_recall": self.object_mean_recall,
             "predicate_mean_recall": self.predicate_mean_recall,
@@ -398,10 +402,17 @@ def pool(scans: Sequence[ScanResult], vocabulary: Vocabulary) -> ProtocolResult:
         for line, ranked in zip(scan.relations, scan.predicate_ranks)
     ]
     relationships = [ranked == 0 for scan in scans for ranked in scan.relationship_ranks]
+    of_detected = [
+        ranked == 0
+        for scan in scans
+        for line, ranked in zip(scan.relations, scan.predicate_ranks)
+        if scan.matching.prediction_of.keys() >= set(line[:2])
+    ]
     return ProtocolResult(
         _count(right for _, right in objects),
         _count(right for _, right in predicates),
         _count(relationships),
+        _count(of_detected),
         _by_class(objects, vocabulary.classes),
         _by_class(predicates, vocabulary.predicates),
         list(scans),

@@ -409,6 +409,7 @@ RECALL_COLUMNS = (
     ("Rel %", "relationship_recall", 100, 1),
     ("Obj %", "object_recall", 100, 1),
     ("Pred %", "predicate_recall", 100, 1),
+    ("of det.", "predicate_recall_of_detected", 100, 1),
     ("mObj", "object_mean_recall", 100, 1),
     ("mPred", "predicate_mean_recall", 100, 1),
 )

@@ -398,7 +398,7 @@ def build_probed(
             config.world_model_path,
         )
     choice = probe.card.inputs, probe.card.crop
-    if config.edge_belief == "paper" and choice != ("clip", "last_frame"):
+    if config.edge_belief != "robust" and choice != ("clip", "last_frame"):
         logger.warning(
             "probe %s gets '%s' of '%s'. The paper's probe gets the clip only, in the region of "
             "its last frame: these are not the paper's results. For those, use a probe trained "

@@ -24,6 +24,7 @@ from deworldsg_ros.scene.arrays import (
     softmax_weights,
 )
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, derived
 from deworldsg_ros.scene.limits import MAX_PREDICTION_SUM_ERROR
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.messages import Provenance
@@ -372,6 +373,20 @@ def neighbour_pairs(
     np.fill_diagonal(near, False)
     pairs = np.argwhere(near).astype(np.int64, copy=False).reshape(-1, 2)
     return pairs, costs[pairs[:, 0], pairs[:, 1]]
+
+
+def candidates(local: LocalGraph, config: RelationsConfig) -> LocalGraph:
+    """A frame's local graph with the relations that are evidence of an edge.
+
+    With `edge_belief: paper`, these are the relations of neighbour pairs (Eq. 8); else all.
+    """
+    if config.edge_belief != "paper":
+        return local
+    relations = local.relations
+    costs = geometric_costs(local.boxes_xyxy, local.depths_m, local.width, local.height)
+    near = costs[relations.pairs[:, 0], relations.pairs[:, 1]] < config.geo_cost_threshold
+    kept = relations.pairs[near], relations.logits[near], relations.scores[near]
+    return derived(local, relations=Relations(*kept))
 
 
 # --- The beliefs of edges as in the paper (Eq. 9-10), rebuilt only where something changed.

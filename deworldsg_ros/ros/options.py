@@ -13,6 +13,7 @@ LIVE_GRAPH = (
     "merging.hellinger_threshold",
     "merging.class_distance_threshold",
     "merging.overlap_threshold",
+    "relations.geo_cost_threshold",
     "output.rate_hz",
 )
 

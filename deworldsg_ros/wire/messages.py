@@ -464,8 +464,8 @@ class EdgeState(msgspec.Struct, frozen=True, gc=False):
     probability: Annotated[
         Probability,
         msgspec.Meta(
-            description="that this relation holds at all; with edge_belief paper: that it is this "
-            "one, if any"
+            description="that this relation holds at all; with edge_belief paper or all_pairs: "
+            "that it is this one, if any"
         ),
     ]
     predicates: Annotated[

@@ -156,9 +156,15 @@ def test_the_files_of_the_paper_differ_only_where_they_have_to(root_dir):
         *("perception.score_threshold", "relations.world_model", "relations.world_model_path"),
         "relations.probe_path",
     }
+    # Networks that were trained for a data set.
+    assert added("paper_replica.yaml", "paper.yaml") == {
+        "perception.detector_path": "./models/fross_vg",
+        "relations.probe_path": "./models/probe_replica",
+    }
     # What options can say of the released predictions.
     assert added("released.yaml", "paper.yaml") == {
         "perception.segmenter": "sam3",
         "perception.segmenter_path": "./models/sam3",
         "relations.entropy_threshold_nats": 0.0,
+        "relations.edge_belief": "all_pairs",
     }

@@ -67,6 +67,15 @@ def test_official_numbers(shared_dir, case, file_name):
                 for item in scan.matching.supports
             ]
             assert supports == official["prediction_supports"]
+        # The paper's definition of the predicate recall, from the official matches and ranks.
+        ranks = []
+        for scan, official in zip(result.scans, run["scans"]):
+            matched = dict(zip(official["gt_object_ids"], official["matched_prediction"]))
+            for (subject, object_, _), ranked in zip(scan.relations, official["predicate_ranks"]):
+                if -1 not in (matched.get(subject, -1), matched.get(object_, -1)):
+                    ranks.append(ranked)
+        assert result.predicates_of_detected == (ranks.count(0), len(ranks))
+        assert 0 < len(ranks) < result.predicates.total
 
 
 def test_rank_is_that_of_a_flipped_stable_sort():

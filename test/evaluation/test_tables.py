@@ -27,6 +27,7 @@ from deworldsg_ros.evaluation.rows import (
     RUNTIME_MS,
     SWITCHES,
     Configurations,
+    paper_file,
     table_rows,
 )
 from deworldsg_ros.evaluation.runner import ScanTask, to_prediction
@@ -225,7 +226,7 @@ def test_the_tables_of_hard_input_and_of_switches(root, tmp_path, kind, name, co
 
 
 # Every row has the default configuration.
-UNCHANGED = Configurations(lambda file, settings, row: Config(), Config())
+UNCHANGED = Configurations(lambda file, settings, row: Config(), "paper", Config())
 TRUE_POSES = [PoseSource()]
 
 
@@ -233,8 +234,8 @@ def rows_of(kind, poses=TRUE_POSES, files=UNCHANGED, front_end="backend"):
     return {row.name: row for row in table_rows(kind, poses, FrontEndChoice(front_end), files)}
 
 
-def configurations(root_dir, tmp_path, settings=()):
-    """The shipped files; the checkpoints of paper.yaml are empty folders, which pass for them."""
+def configurations(root_dir, tmp_path, settings=(), layout="3rscan"):
+    """The shipped files; the checkpoints of the paper are empty folders, which pass for them."""
     paths = ("perception.detector", "perception.segmenter", "relations.world_model")
     given = [f"{name}_path={tmp_path}" for name in (*paths, "relations.probe")]
 
@@ -242,7 +243,8 @@ def configurations(root_dir, tmp_path, settings=()):
         changes = [*given, "perception.threads=1", *own, *settings]
         return effective_config(root_dir / "config" / f"{file}.yaml", changes)
 
-    return Configurations(configure, load_config(root_dir / "config" / "paper.yaml"))
+    paper = paper_file(layout)
+    return Configurations(configure, paper, load_config(root_dir / "config" / f"{paper}.yaml"))
 
 
 def test_rows_with_the_papers_networks_are_named_and_compared_with_the_paper(root_dir, tmp_path):
@@ -254,6 +256,9 @@ def test_rows_with_the_papers_networks_are_named_and_compared_with_the_paper(roo
     posed = rows_of("pose", [PoseSource(kind) for kind in POSE_KINDS], files=files)
     assert posed["paper-ground-truth"].printed == "DeWorldSG"
     assert posed["paper-odometry"].printed == posed["paper-perturbed"].printed == ""
+    # ReplicaSSG has a file of its own.
+    rows = rows_of("pose", files=configurations(root_dir, tmp_path, layout="replica"))
+    assert rows["paper_replica-ground-truth"].printed == "DeWorldSG"
     # Without the paper's checkpoints its rules run on the embedded perception.
     rows = rows_of("main", files=configurations(root_dir, tmp_path / "missing"))
     assert list(rows) == ["fross", "kim", "paper_rules", "default"]

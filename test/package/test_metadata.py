@@ -58,7 +58,8 @@ def test_every_imported_library_is_a_requirement(root_dir):
 
 
 @pytest.mark.parametrize(
-    "name", ["default.yaml", "paper.yaml", "paper_rules.yaml", "released.yaml"]
+    "name",
+    ["default.yaml", "paper.yaml", "paper_replica.yaml", "paper_rules.yaml", "released.yaml"],
 )
 def test_a_shipped_configuration_contains_only_changed_values(root_dir, name):
     path = root_dir / "config" / name

@@ -14,9 +14,9 @@ from deworldsg_ros.evaluation.rows import REPLICA_TEST_SCANS, RUNTIME_MS
 from deworldsg_ros.lifting.stage import LiftingConstants
 
 # Where an option has the value of the paper: everywhere; not by default; for its networks only.
-RULES = ("paper.yaml", "paper_rules.yaml")
+RULES = ("paper.yaml", "paper_replica.yaml", "paper_rules.yaml")
 EVERYWHERE = (*RULES, "default.yaml", "built in")
-NETWORKS = ("paper.yaml",)
+NETWORKS = ("paper.yaml", "paper_replica.yaml")
 # Words of the paper's source without spaces and braces, option, value, files.
 OPTIONS = [
     # Sec. 5, Implementation Details.

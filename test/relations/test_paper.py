@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import merging
 
-from deworldsg_ros.config import Config, RelationsConfig
+from deworldsg_ros.cli.configuration import effective_config
+from deworldsg_ros.config import Config, RelationsConfig, load_config
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.relations import paper
 from deworldsg_ros.scene.errors import RefusedInput
@@ -239,3 +240,23 @@ def test_the_option_chooses_the_logits_that_are_summed(edge_belief: str, rate: f
     expected = logits if rate is None else paper.bounded_logits(logits, rate)
     assert (builder.graph.edges[a, b].visual_logits == expected[0]).all()
     assert (builder.graph.edges[b, a].visual_logits == expected[1]).all()
+
+
+@pytest.mark.parametrize("name", ["paper", "paper_rules", "released"])
+def test_by_the_papers_text_a_relation_of_no_neighbours_is_no_edge(root_dir, name: str) -> None:
+    """Of three objects, the last one is 4 m behind the others."""
+    file = root_dir / "config" / f"{name}.yaml"
+    builder = GraphBuilder(load_config(file), merging.VOCABULARY, "world")
+    means = np.array([[0.0, 0, 2], [0.3, 0, 2], [0, 0, 6]])
+    seen = means, np.tile(np.eye(3) * 1e-2, (3, 1, 1)), np.full((3, 4), 0.25)
+    pairs, logits = [(0, 1), (0, 2), (2, 1)], np.tile([9.0, 0, 0], (3, 1))
+    several = {"pairs": pairs, "logits": logits, "depths_m": means[:, 2]}
+    a, b, far = builder.integrate(merging.local_graph(1, *seen, **several))
+    frames = {pair: edge.frames for pair, edge in builder.graph.edges.items()}
+    only_neighbours = name in ("paper", "paper_rules")
+    assert frames == ({(a, b): 1} if only_neighbours else {(a, b): 1, (a, far): 1, (far, b): 1})
+    known = {(item.node, item.other) for item in builder.frames.all(builder.graph) if item.other}
+    assert known == frames.keys()  # where an edge comes from
+    builder.configure(effective_config(file, ["relations.geo_cost_threshold=5"]))
+    builder.integrate(merging.local_graph(2, *seen, **several))
+    assert builder.graph.edges[a, far].frames == (1 if only_neighbours else 2)

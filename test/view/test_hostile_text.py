@@ -90,7 +90,7 @@ def test_names_of_parameters_and_scores_are_text(tmp_path):
     count = Count(1, 2)
     classes = {"b\x1b[2J": count}
     print_protocol(
-        terminal, ProtocolResult(count, count, count, classes, classes, []), "title \x1b[2J"
+        terminal, ProtocolResult(count, count, count, count, classes, classes, []), "title \x1b[2J"
     )
     assert output.getvalue().count("u001b[2J") == 4
     assert is_text(output.getvalue())
