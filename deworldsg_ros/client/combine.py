@@ -443,9 +443,11 @@ def _fused(a: SceneObject, b: SceneObject) -> wire.NodeState:
     seen_more = a if count >= more else b
     known = [item for item in (a.existence, b.existence) if item is not None]
     first, last = min(a.first_seen_ns, b.first_seen_ns), max(a.last_seen_ns, b.last_seen_ns)
+    named = a.is_named or b.is_named
     return msgspec.structs.replace(
         a.state,
-        label=best[0][0],
+        label=best[0][0] if named else a.label,
+        named=named,
         classes=[wire.Belief(label, round(value, 4)) for label, value in best],
         remainder=round(max(0.0, 1.0 - sum(value for _, value in best)), 4),
         **_geometry(mean, covariance, points),

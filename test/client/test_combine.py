@@ -112,6 +112,14 @@ def test_sums_of_a_merge_are_those_that_a_message_may_have():
     assert combine.combine(last, last, same).ids == {most: most}
 
 
+def test_a_name_of_one_graph_is_that_of_both():
+    unnamed = make_node(1, "object", named=False, classes=[wire.Belief("cup", 0.4)])
+    graphs = [SceneGraph(make_graph([node])) for node in (unnamed, make_node(1, "cup"))]
+    for a, b, name in ((0, 0, "object"), (0, 1, "cup"), (1, 0, "cup")):
+        (node,) = combine.combine(graphs[a], graphs[b], np.eye(4)).message.nodes
+        assert (node.label, node.named) == (name, name == "cup")
+
+
 def objects(count: int, seed: int) -> list[SceneObject]:
     rng = np.random.default_rng(seed)
     labels, places = rng.choice(["cup", "chair", "lamp"], count), rng.uniform(0, 3, (count, 3))
