@@ -257,6 +257,9 @@ MERGE_THRESHOLD = 9
 # A frame that shows both as two objects outweighs ten in which one object overlapped both. A
 # detector seldom makes two objects of one, but it often detects only one of two that touch.
 SEPARATE_WEIGHT = 30
+# Two objects that three viewpoints have shown together are two, whatever place they stand in: the
+# mask of a chair may take in the one beside it for many frames.
+TWO_OBJECTS = 3 * SEPARATE_WEIGHT
 # A detection with a lower score is unsure. An object lies on a node if at least this fraction of
 # its cells does. With NanoDet (scores from 0.2; a rendered room and the shipped recording), 36 % of
 # 1253 pairs of one frame and class with an unsure detection were one object if one lay on the
@@ -419,6 +422,10 @@ class JointEvidence:
             self._add(a, b, self._for[a, b] - said)
             if self._balances[a][b] >= MERGE_THRESHOLD:
                 self._due.append((a, b))
+
+    def are_two(self, a: int, b: int) -> bool:
+        """Whether viewpoints enough have shown the nodes of two slots as two objects."""
+        return self._balances[min(a, b)].get(max(a, b), 0) <= -TWO_OBJECTS
 
     def next_merge(self) -> Pair | None:
         """The next pair that is one object; the caller has to merge it. None = no more."""

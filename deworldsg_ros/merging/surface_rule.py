@@ -241,9 +241,9 @@ class SurfaceMerging:
         merged = False
         while (pair := records.joint.next_merge()) is not None:
             merged |= self._merge_pair(graph, *pair)
-        for pair in in_one_place(graph, slots, view_slots):
-            if records.node(pair[0]) and records.node(pair[1]):
-                merged |= self._merge_pair(graph, *pair)
+        for a, b in in_one_place(graph, slots, view_slots):
+            if records.node(a) and records.node(b) and not records.joint.are_two(a, b):
+                merged |= self._merge_pair(graph, a, b)
         return [graph.resolve(node_id) for node_id in node_ids] if merged else node_ids
 
     def _merge_pair(self, graph: GlobalGraph, a: int, b: int) -> bool:

@@ -151,6 +151,20 @@ def test_parts_of_a_chair_over_each_other_are_one(scene, label, x_m, up, count) 
     assert pairs == [tuple(slots.tolist())][: 2 - count]
 
 
+@pytest.mark.parametrize(("viewpoints", "are_two"), [(2, False), (4, True)])
+def test_two_that_viewpoints_have_shown_together_are_two(scene, viewpoints, are_two) -> None:
+    """A chair in the place of another one, as a mask that takes in both makes it."""
+    back = slab((0.2, 0, 0.8), (0.05, 0.45, 0.3))
+    for index in range(viewpoints):
+        pose = np.eye(4)
+        pose[0, 3] = 0.3 * index
+        scene.see((SEAT, CHAIR), (back, CHAIR), times=2, T_world_camera=pose)
+    scene.graph.up_world = np.array((0.0, 0.0, 1.0))
+    joint = scene.merging._records.joint
+    assert in_one_place(scene.graph, [0], np.array([1])) == [(0, 1)]
+    assert joint.are_two(0, 1) == joint.are_two(1, 0) == are_two
+
+
 def test_a_node_of_two_objects_loses_the_surface_of_one_when_both_are_detected(scene) -> None:
     left, right = slab((-0.06, 0, 1), (0.12, 0.3, 0.004)), slab((0.06, 0, 1), (0.12, 0.3, 0.004))
     both = np.concatenate((left, right))
