@@ -44,6 +44,7 @@ from deworldsg_ros.cli.evaluate_options import (
     DataOptions,
     DetectionOptions,
     JsonFile,
+    LossOptions,
     RunOptions,
     ScoringOptions,
     TableOptions,
@@ -447,6 +448,20 @@ def evaluate_table(
     make_table(kind, data, detections, running, comparing, scoring, out, json_file)
 
 
+@with_option_groups
+def evaluate_losses(
+    data: LossOptions,
+    detections: DetectionOptions,
+    running: RunOptions,
+    out: EvaluationFolder,
+    json_file: JsonFile = None,
+) -> None:
+    """Run the pipeline, and say of each annotated object which stage lost it, with a picture."""
+    from deworldsg_ros.cli.evaluate import list_losses
+
+    list_losses(data, detections, running, out, json_file)
+
+
 evaluation = typer.Typer(
     name="evaluate", help="Measure scene graphs against annotations.", no_args_is_help=True
 )
@@ -455,6 +470,7 @@ for parent, function, summary in (
     (evaluation, evaluate_score, "Score predictions or scene graphs of earlier runs."),
     (evaluation, evaluate_run, "Run the pipeline on every scan and score its graphs."),
     (evaluation, evaluate_table, "Compare methods or configurations in a table."),
+    (evaluation, evaluate_losses, "Find the stage that lost each annotated object."),
     (app, ask.query, "Ask a scene graph in words."),
     (app, ask.goal, "Print a pose from which an object is in view."),
     (app, ask.explain, "Explain an object, a relation or a class."),

@@ -22,6 +22,7 @@ from rich.table import Table
 from deworldsg_ros.base.files import write_atomically
 from deworldsg_ros.base.words import counted, visible, whole_number
 from deworldsg_ros.client.combine import combine
+from deworldsg_ros.client.explain import place_of
 from deworldsg_ros.client.export import FORMATS
 from deworldsg_ros.client.export import export as export_graph
 from deworldsg_ros.client.graph import SceneGraph
@@ -29,6 +30,7 @@ from deworldsg_ros.client.mcp_server import WatchedFile, make_server
 from deworldsg_ros.client.objects import SURE, odds_of
 from deworldsg_ros.client.questions import Answers, ask
 from deworldsg_ros.graph.edits import DeleteNode, EditRequest, MergeNodes, SetLabel, SplitNode, Undo
+from deworldsg_ros.graph.extent import DEFAULT_UP
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import rigid_motion
 from deworldsg_ros.scene.errors import ClientError
@@ -128,18 +130,30 @@ def explain(
 ) -> None:
     """Explain why an object, a pair of objects or a class is in the graph, or is not.
 
-    The words are an id, two ids, or a class.
+    The words are an id, two ids, a class, or a class and a place: "chair near (1.6, -0.5)".
     """
+    if live and place_of(" ".join(words), DEFAULT_UP):
+        from deworldsg_ros.client import SceneGraphClient
+
+        with SceneGraphClient(namespace) as client:
+            client.wait(timeout_s=10.0)
+            told = client.explain(" ".join(words))
+        _print_explanation(told["subject"], told["lines"], told if as_json else None)
+        return
     with _opened(words, live, namespace) as (graph, rest):
         first, *others = [whole_number(word) for word in rest]
         if len(others) == 1 and first is not None and others[0] is not None:
             found = graph.explain((first, others[0]))
         else:
             found = graph.explain(_which(rest))
-        if as_json:
-            print_json({"subject": found.subject, "lines": list(found.lines), **found.values})
-        else:
-            print_lines([found.subject, *(f"  {line}" for line in found.lines)])
+    _print_explanation(found.subject, found.lines, found.to_dict() if as_json else None)
+
+
+def _print_explanation(subject: str, lines: Iterable[str], values: dict[str, Any] | None) -> None:
+    if values is not None:
+        print_json(values)
+    else:
+        print_lines([subject, *(f"  {line}" for line in lines)])
 
 
 def print_json(content: Any) -> None:

@@ -47,8 +47,7 @@ from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.recordings.source import ODOMETRY, Role
-from deworldsg_ros.ros.health import DROPPED, LEFT_OUT, counts_in
-from deworldsg_ros.ros.statuses import observations_of
+from deworldsg_ros.ros.health import DROPPED, LEFT_OUT, counts_in, observations_of
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError, RecordingError
 from deworldsg_ros.view.photos import Album

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import typer
+from rich import box
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
-from deworldsg_ros.base.words import visible_lines
+from deworldsg_ros.base.words import visible, visible_lines
 from deworldsg_ros.cli.configuration import EXIT_NOTHING_DONE, effective_config
 from deworldsg_ros.cli.evaluate_options import (
     DataOptions,
     DetectionOptions,
+    LossOptions,
     RunOptions,
     ScoringOptions,
     TableOptions,
@@ -30,6 +33,13 @@ from deworldsg_ros.evaluation.front_ends import (
     FrontEndChoice,
     PoseSource,
     parse_faults,
+)
+from deworldsg_ros.evaluation.losses import (
+    LOSSES_FILE,
+    STAGES,
+    Loss,
+    count_stages,
+    trace_scan,
 )
 from deworldsg_ros.evaluation.recorded_room import open_annotations
 from deworldsg_ros.evaluation.reports import (
@@ -155,9 +165,7 @@ def run_scans(
         for task in scan_tasks(annotations, data, detections, running, scoring, out)
     ]
     outcomes, failures = _run_all(tasks, console)
-    for scan, reason in failures.items():
-        line = Text.assemble(("failed:", "red"), " " + visible_lines(f"{scan}: {reason}"))
-        console.print(line, highlight=False, soft_wrap=True)
+    _print_failures(failures, console)
     if not outcomes:
         raise typer.Exit(EXIT_NOTHING_DONE)
     front_end = tasks[0].front_end.describe()
@@ -171,6 +179,12 @@ def run_scans(
         "failed": failures,
     }
     finish(values, json_file, console)
+
+
+def _print_failures(failures: Mapping[str, str], console: Console) -> None:
+    for scan, reason in failures.items():
+        line = Text.assemble(("failed:", "red"), " " + visible_lines(f"{scan}: {reason}"))
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def front_end_choice(detections: DetectionOptions) -> FrontEndChoice:
@@ -205,7 +219,7 @@ def pose_sources(running: RunOptions, default: Sequence[str] = ()) -> list[PoseS
 
 
 def scan_tasks(
-    annotations: Annotations,
+    annotations: Annotations | None,
     data: DataOptions,
     detections: DetectionOptions,
     running: RunOptions,
@@ -214,11 +228,13 @@ def scan_tasks(
 ) -> list[ScanTask]:
     """One task per scan, with the default configuration and ground-truth poses.
 
+    Without annotations, `data` lists the scans.
+
     Raises:
         DeWorldSGError: the options cannot be used, or there is no scan.
     """
     front_end = front_end_choice(detections)
-    scans = data.scans or annotations.scans(data.split)
+    scans = data.scans or (annotations.scans(data.split) if annotations else [])
     if not scans:
         raise EvaluationError(
             f"--split {data.split} of {data.dataset} has no scan: give another split, or --scan"
@@ -254,6 +270,117 @@ def _run_all(
             except DeWorldSGError as error:
                 failures[task.scan] = str(error)
     return outcomes, failures
+
+
+# --- `deworldsg evaluate losses`: the stage that lost each annotated object.
+
+
+def list_losses(
+    data: LossOptions,
+    detections: DetectionOptions,
+    running: RunOptions,
+    out: Path,
+    json_file: Path | None,
+) -> None:
+    """Run the scans, print the stage of each lost object, and write the pictures.
+
+    Raises:
+        DeWorldSGError: the options or the data set cannot be used; a scan that fails is reported.
+        typer.Exit: every scan failed.
+    """
+    console = Console(markup=False)
+    poses = pose_sources(running)
+    if len(poses) > 1:
+        raise EvaluationError(f"evaluate losses has {len(poses)} --poses: give one")
+    if (data.boxes is None) != bool(data.layout):
+        seen = "both" if data.layout else "none"
+        raise EvaluationError(
+            f"evaluate losses has {seen} of --layout and --boxes: --layout LAYOUT names the layout "
+            "of a data set, --boxes FILE the objects of any other recording"
+        )
+    config = effective_config(running.config, running.settings)
+    tasks = [
+        replace(task, config=config, poses=poses[0])
+        for task in _loss_tasks(data, detections, running, out)
+    ]
+    found: dict[str, list[Loss]] = {}
+    failures: dict[str, str] = {}
+    for number, task in enumerate(tasks, start=1):
+        with console.status(f"scan {number} of {len(tasks)}: {task.scan} …"):
+            try:
+                found[task.scan] = trace_scan(task, data.boxes)
+            except DeWorldSGError as error:
+                failures[task.scan] = str(error)
+    _print_failures(failures, console)
+    if not found:
+        raise typer.Exit(EXIT_NOTHING_DONE)
+    for scan, losses in found.items():
+        _print_losses(scan, losses, console)
+    _print_stages(found, console)
+    console.print(
+        f"pictures and {LOSSES_FILE} in {', '.join(str(out / scan) for scan in found)}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    values = {
+        "dataset": data.dataset.resolve().name,
+        "front_end": tasks[0].front_end.describe(),
+        "scans": {
+            scan: {
+                "stages": count_stages(losses),
+                "objects": [loss.to_dict() for loss in losses],
+            }
+            for scan, losses in found.items()
+        },
+        "failed": failures,
+    }
+    finish(values, json_file, console)
+
+
+def _loss_tasks(
+    data: LossOptions, detections: DetectionOptions, running: RunOptions, out: Path
+) -> list[ScanTask]:
+    scoring = ScoringOptions()
+    known = DataOptions(data.dataset, data.layout, data.split, data.scans)
+    if data.boxes is None:
+        annotations = open_annotations(data.dataset, data.layout)
+        return scan_tasks(annotations, known, detections, running, scoring, out)
+    if detections.front_end != "backend":
+        raise EvaluationError(
+            f"--boxes with --front-end {detections.front_end}: a recording without a data set has "
+            "no annotated detections; expected backend"
+        )
+    if data.scans:
+        raise EvaluationError(
+            f"--boxes with --scan {data.scans[0]}: the file has the objects of one recording"
+        )
+    known = replace(known, scans=[data.dataset.resolve().stem])
+    return scan_tasks(None, known, detections, running, scoring, out)
+
+
+def _print_losses(scan: str, losses: Sequence[Loss], console: Console) -> None:
+    console.print(Text(visible(f"lost objects of {scan}:"), style="bold"))
+    for loss in losses:
+        if loss.stage == "found":
+            continue
+        note = "" if loss.has_class else "; the detector has no such class"
+        picture = f" ({loss.picture})" if loss.picture else ""
+        why = visible(f": {loss.detail}{note}{picture}")
+        line = Text.assemble(f"  {visible(loss.item.title)}: ", (loss.stage, "yellow"), why)
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def _print_stages(found: Mapping[str, Sequence[Loss]], console: Console) -> None:
+    table = Table(title="objects by stage", box=box.SIMPLE)
+    table.add_column("stage")
+    for scan in found:
+        table.add_column(Text(visible(scan)), justify="right", overflow="fold")
+    table.add_column("")
+    counts = {scan: count_stages(losses) for scan, losses in found.items()}
+    for stage in (*STAGES, "duplicates"):
+        numbers = (str(counts[scan][stage]) for scan in found)
+        table.add_row(stage, *numbers, STAGES.get(stage, "further nodes of found objects"))
+    console.print(table)
 
 
 # --- `deworldsg evaluate table`: methods or configurations compared.

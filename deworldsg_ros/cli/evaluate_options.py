@@ -32,6 +32,32 @@ class DataOptions:
 
 
 @dataclass(frozen=True)
+class LossOptions:
+    """Annotated data, or a recording and boxes."""
+
+    dataset: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DATASET",
+            help="root folder with data/ and the annotations, a recording with ground truth, or, "
+            "with --boxes, any recording",
+        ),
+    ]
+    layout: Annotated[
+        str, typer.Option("--layout", help="replica, 3rscan or recording; not with --boxes")
+    ] = ""
+    boxes: Annotated[
+        Optional[Path],
+        typer.Option("--boxes", metavar="FILE", help="JSON file of objects: names and boxes"),
+    ] = None
+    split: Annotated[str, typer.Option("--split", help="train, validation or test")] = "test"
+    scans: Annotated[
+        Optional[list[str]],
+        typer.Option("--scan", help="this scan only, not the split; may be repeated"),
+    ] = None
+
+
+@dataclass(frozen=True)
 class ScoringOptions:
     """Options of the official protocol."""
 

@@ -3,22 +3,37 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
 from deworldsg_ros.base.words import counted
-from deworldsg_ros.client.boxes import gap_m, horizontal_gap_m, vertical_gap_m
+from deworldsg_ros.client.boxes import (
+    Footprint,
+    footprint,
+    gap_m,
+    horizontal_gap_m,
+    vertical_gap_m,
+)
 from deworldsg_ros.client.meanings import is_class
-from deworldsg_ros.client.objects import HiddenObject, Relation, SceneObject, odds_of
+from deworldsg_ros.client.objects import HiddenObject, Point, Relation, SceneObject, odds_of
+from deworldsg_ros.graph.messages import ABSENT
 from deworldsg_ros.graph.pairs import Between, contradicted
-from deworldsg_ros.graph.provenance import SeenFrames
+from deworldsg_ros.graph.provenance import SeenFrames, SeenSpace
 from deworldsg_ros.scene.vocabulary import CARRY_ON_TOP, PREDICATES, plain
 
 # Two boxes are in contact below this gap: the error of a measured extent.
 CONTACT_M = 0.04
+# Of a place: so many objects are named; a class with less is no guess; seen space lies so far
+# around it, and with less of it seen it was never in view.
+MOST_NEAR = 5
+LEAST_GUESS = 0.1
+AROUND_M, LEAST_SEEN = 0.3, 0.1
+ANYTHING = "anything"
 
 
 @dataclass(frozen=True)
@@ -34,6 +49,10 @@ class Explanation:
     subject: str
     lines: tuple[str, ...]
     values: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; of a relation, `subject` is its subject."""
+        return {"subject": self.subject, "lines": list(self.lines), **self.values}
 
     def __str__(self) -> str:
         return "\n".join([self.subject, *(f"  {line}" for line in self.lines)])
@@ -155,6 +174,183 @@ def explain_absence(
         "hidden": [item.to_dict() for item in found],
     }
     return Explanation(f"no object of class '{asked}'", tuple(lines), values)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A class, and where one was expected.
+
+    Attributes:
+        label: the class; "anything" for any.
+        point_m: the point, world frame; of two numbers the horizontal ones, with any height.
+        is_column: whether the height is open.
+        within_m: largest distance.
+    """
+
+    label: str
+    point_m: Point
+    is_column: bool
+    within_m: float = 1.0
+
+    def gap_m(self, position_m: Point, item: SceneObject | None, up: Point) -> float:
+        """Distance of the place from the box of an object, or from a position without a box."""
+        here = _footprint_of(self.point_m, up)
+        there = _footprint_of(position_m, up) if item is None else item.footprint
+        return horizontal_gap_m(here, there) if self.is_column else gap_m(here, there)
+
+
+_NUMBER = r"[+-]?[0-9]{0,9}\.?[0-9]{1,9}"
+_PLACE = re.compile(
+    rf"(.+?)\s+near\s*\(\s*({_NUMBER})\s*,\s*({_NUMBER})\s*(?:,\s*({_NUMBER})\s*)?\)"
+    r"(?:\s+within\s+([0-9]{0,9}\.?[0-9]{1,9})\s*(cm|m)?)?"
+)
+
+
+def place_of(text: str, up: Point) -> Place | None:
+    """The place that a text such as ``chair near (1.6, -0.5)`` names; None if it names none.
+
+    Two numbers are the two horizontal coordinates, in the order of the axes; a third one, of the
+    vertical axis, makes them a point. After them, ``within 50 cm`` is the largest distance; else it
+    is 1 m.
+    """
+    match = _PLACE.fullmatch(text.strip())
+    if match is None:
+        return None
+    label, *numbers, within, unit = match.groups()
+    within_m = float(within or 1.0) * (0.01 if unit == "cm" else 1.0)
+    values = [float(number) for number in numbers if number is not None]
+    if len(values) == 2:
+        values.insert(int(np.argmax(np.abs(up))), 0.0)
+    return Place(label, (values[0], values[1], values[2]), numbers[2] is None, within_m)
+
+
+def _footprint_of(position_m: Point, up: Point) -> Footprint:
+    return footprint(position_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), up)
+
+
+def explain_place(
+    place: Place,
+    objects: Sequence[SceneObject],
+    hidden: Sequence[HiddenObject] | None,
+    space: SeenSpace | None,
+    up: Point,
+) -> Explanation:
+    """What is known of an object of a class near a place.
+
+    Args:
+        place: the class and the place.
+        objects: all objects of the graph.
+        hidden: objects that were detected and are not in the graph; None = not known.
+        space: what the camera has seen; None = not known.
+        up: unit vector against gravity, world frame.
+    """
+    gaps = [(place.gap_m(item.position_m, item, up), item) for item in objects]
+    near = [pair for pair in sorted(gaps, key=itemgetter(0)) if pair[0] <= place.within_m]
+    apart = [(place.gap_m(item.position_m, None, up), item) for item in hidden or ()]
+    asides = [pair for pair in sorted(apart, key=itemgetter(0)) if pair[0] <= place.within_m]
+    lines = [_object_line(place, gap, item) for gap, item in near[:MOST_NEAR]]
+    lines += [
+        f"{_fate(item)}, {gap:.2f} m away: {item.label}, {item.reason}; detected in "
+        f"{counted(item.observations, 'frame')}, exists with {item.existence:.0%}"
+        for gap, item in asides[:MOST_NEAR]
+    ]
+    more = len(near) + len(asides) - len(lines)
+    if more:
+        lines.append(f"and {more} more")
+    if hidden is None:
+        lines.append("hidden objects: not in this message; a saved file lists them")
+    shares = _space_there(place, objects, space, up)
+    lines.append(_space_line(shares))
+    values = {
+        "label": place.label,
+        "near_m": list(place.point_m),
+        "any_height": place.is_column,
+        "within_m": place.within_m,
+        "known": _verdict(place, [item for _, item in near], [item for _, item in asides], shares),
+        "objects": [{"gap_m": round(gap, 3), **item.to_dict()} for gap, item in near],
+        "hidden": [{"gap_m": round(gap, 3), **item.to_dict()} for gap, item in asides],
+        "space": shares,
+    }
+    axes = np.arange(3) != np.argmax(np.abs(up)) if place.is_column else np.ones(3, bool)
+    at = ", ".join(f"{value:.2f}" for value in np.array(place.point_m)[axes])
+    subject = f"{place.label} near ({at}), within {place.within_m:g} m: {values['known']}"
+    return Explanation(subject, tuple(lines), values)
+
+
+def _fate(item: HiddenObject) -> str:
+    return "removed" if item.reason == ABSENT else "hidden"
+
+
+def _is_one(place: Place, label: str) -> bool:
+    return place.label == ANYTHING or is_class(place.label, label)
+
+
+def _object_line(place: Place, gap: float, item: SceneObject) -> str:
+    guesses = ", ".join(f"{belief.label} {belief.probability:.0%}" for belief in item.classes[:3])
+    line = f"{item.name}, {gap:.2f} m away: {guesses}"
+    if not item.is_named:
+        return f"{line}; no class is probable enough for a name"
+    if _is_one(place, item.label):
+        return line
+    return f"{line}; a {place.label} with {item.probability_of(place.label):.0%}"
+
+
+def _verdict(
+    place: Place,
+    near: Sequence[SceneObject],
+    hidden: Sequence[HiddenObject],
+    shares: dict[str, float] | None,
+) -> str:
+    """What is known, in a few words: the surest first."""
+    any_ = place.label == ANYTHING
+    ones = [item for item in near if any_ or (item.is_named and _is_one(place, item.label))]
+    if ones:
+        return f"{ones[0].name} is there"
+    unseen = [item for item in hidden if _is_one(place, item.label)]
+    guessed = [item for item in near if item.probability_of(place.label) >= LEAST_GUESS]
+    if guessed:
+        best = max(guessed, key=lambda item: item.probability_of(place.label))
+        return f"{best.name} may be it"
+    if unseen:
+        return f"{_fate(unseen[0])}: {unseen[0].reason}"
+    if near:
+        return f"other objects are there, {near[0].name} the nearest"
+    if hidden:
+        return f"something else there is {_fate(hidden[0])}: {hidden[0].reason}"
+    if shares is None:
+        return "nothing was detected there"
+    if shares["free"] + shares["occupied"] < LEAST_SEEN:
+        return "never in view"
+    return "nothing was detected there, though it was in view"
+
+
+def _space_there(
+    place: Place, objects: Sequence[SceneObject], space: SeenSpace | None, up: Point
+) -> dict[str, float] | None:
+    """Parts of the place that were seen as free and as occupied; None = not known."""
+    if space is None:
+        return None
+    steps = np.linspace(-AROUND_M, AROUND_M, 7)
+    offsets = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    points = np.array(place.point_m) + offsets
+    if place.is_column:
+        heights = [item.height_m for item in objects] or [0.0]
+        low, high = min(heights) - AROUND_M, max(heights) + AROUND_M
+        spread = (offsets @ np.array(up) / AROUND_M + 1) / 2
+        wanted = low + spread * (high - low)
+        points += (wanted - points @ np.array(up))[:, None] * np.array(up)
+    free, occupied = space.look(points)
+    return {"free": round(float(free.mean()), 3), "occupied": round(float(occupied.mean()), 3)}
+
+
+def _space_line(shares: dict[str, float] | None) -> str:
+    if shares is None:
+        return "free space and views: not known here; the folder of a run has them"
+    unseen = 1.0 - shares["free"] - shares["occupied"]
+    return (
+        f"the space there: {shares['free']:.0%} seen as free, {shares['occupied']:.0%} as a "
+        f"surface, {unseen:.0%} never in view"
+    )
 
 
 def explain_no_relation(a: SceneObject, b: SceneObject) -> Explanation:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,14 @@ from deworldsg_ros.base.words import counted, visible
 from deworldsg_ros.client.boxes import Triple, box_of, footprint, gap_m
 from deworldsg_ros.client.changes import Changes, changes_by_id, changes_by_place
 from deworldsg_ros.client.explain import (
+    ANYTHING,
     Explanation,
     explain_absence,
     explain_no_relation,
     explain_object,
+    explain_place,
     explain_relation,
+    place_of,
 )
 from deworldsg_ros.client.goals import ROBOT_RADIUS_M, Goal, free_direction, goal_near
 from deworldsg_ros.client.meanings import (
@@ -583,7 +586,15 @@ class SceneGraph:
         return self.similar(embed_text(model or self.looks.model, text), k)
 
     def explain(self, what: Which | Relation | tuple[Which, Which]) -> Explanation:
-        """Why something is in the graph, or is not: an object, a relation, a pair, or a class."""
+        """Why something is in the graph, or is not: an object, a relation, a pair, or a class.
+
+        Or what is known of a place: ``chair near (1.6, -0.5)``, see `explain.place_of`.
+        """
+        place = place_of(what, self.up) if isinstance(what, str) else None
+        if place is not None:
+            if place.label != ANYTHING:
+                place = replace(place, label=self.understand(place.label).meant)
+            return explain_place(place, list(self), self.hidden, self.space, self.up)
         if isinstance(what, tuple):
             a, b = self.one(what[0]), self.one(what[1])
             found = self.relations(a, None, b) or self.relations(b, None, a)

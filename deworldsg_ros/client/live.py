@@ -229,6 +229,23 @@ class SceneGraphClient:
         except NoService:
             return self.graph.goal_near(of, distance_m).to_dict()
 
+    def explain(self, what: int | str) -> dict[str, Any]:
+        """Ask the node why an object is in its graph, or what it knows of a place.
+
+        The node knows hidden objects, frames and seen space, which the copy of its topics has not.
+        The copy answers where no node does, as for the graphs of fleets and regions.
+
+        Args:
+            what: id, class, or a place such as ``chair near (1.6, -0.5)``.
+
+        Raises:
+            ClientError: there is no such object or class.
+        """
+        try:
+            return self.command("explain", object=what)
+        except NoService:
+            return self.graph.explain(what).to_dict()
+
     def on_change(self, callback: Callback) -> None:
         """Call a function with the new graph and the changes, after every change of the graph.
 

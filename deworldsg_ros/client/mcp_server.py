@@ -11,6 +11,7 @@ from typing import Any
 
 from deworldsg_ros import __version__
 from deworldsg_ros.base.words import whole_number
+from deworldsg_ros.client.explain import place_of
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
 from deworldsg_ros.client.questions import ask
@@ -103,11 +104,15 @@ class GraphTools:
         """Tell everything about one object: class, place, size, relations, neighbours, evidence.
 
         Args:
-            object: id, or class; of a class, the most probable object.
+            object: id, or class; of a class, the most probable object. Or a place, as in "chair
+                near (1.6, -0.5)": what is known of a chair there.
         """
         graph = self._graph()
         which = _which(object)
-        if which is None or (isinstance(which, str) and not graph.objects(which)):
+        if which is None or (
+            isinstance(which, str)
+            and (place_of(which, graph.up) is not None or not graph.objects(which))
+        ):
             return {**_about(graph), "explanation": str(graph.explain(object))}
         item = graph.one(which)
         return {

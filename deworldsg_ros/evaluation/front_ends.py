@@ -469,7 +469,6 @@ def build_front_end(
         choice.faults,
         choice.seed,
     )
-    frame_numbers = _frame_numbers(annotations, scan, source)
     top_relations = config.perception.max_relations
     if recorded:
         if not isinstance(source, SequenceDataset):
@@ -479,21 +478,13 @@ def build_front_end(
             )
         return RecordedFrontEnd(
             source.sequence,
-            frame_numbers,
+            _frame_numbers(annotations, scan, source),
             vocabulary,
             flip=choice.flip,
             top_relations=top_relations,
             injection=injection,
         )
-
-    def instances(frame: RgbdFrame) -> UInt16 | None:
-        if isinstance(annotations, RecordedRoom):
-            return annotations.instances(frame.stamp_ns)
-        return read_instances(source, frame.stamp_ns)
-
-    objects = AnnotatedObjects(
-        frame_numbers, instances, annotation, annotations.points(scan), len(vocabulary.classes)
-    )
+    objects = annotated_objects(annotations, scan, source)
     if choice.kind == "boxes":
         return _boxes(objects, injection, annotations, config)
     return GroundTruthFrontEnd(
@@ -503,6 +494,23 @@ def build_front_end(
         seed=choice.seed,
         top_relations=top_relations,
         injection=injection,
+    )
+
+
+def annotated_objects(annotations: Annotations, scan: str, source: Source) -> AnnotatedObjects:
+    """The annotated objects of a scan in its frames; raises EvaluationError, RecordingError."""
+
+    def instances(frame: RgbdFrame) -> UInt16 | None:
+        if isinstance(annotations, RecordedRoom):
+            return annotations.instances(frame.stamp_ns)
+        return read_instances(source, frame.stamp_ns)
+
+    return AnnotatedObjects(
+        _frame_numbers(annotations, scan, source),
+        instances,
+        annotations.scan(scan),
+        annotations.points(scan),
+        len(annotations.vocabulary.classes),
     )
 
 

@@ -1,4 +1,4 @@
-"""A recording with ground truth, as a data set of one scan.
+"""A recording with ground truth, as a data set of one scan; and objects as boxes.
 
 The files ``NAME.gt.json`` and ``NAME.instances.npz`` are beside the bag ``NAME`` (bags/README.md).
 Classes are those of COCO. Only objects that can be detected, and relations between them, count.
@@ -9,6 +9,8 @@ from __future__ import annotations
 import functools
 import lzma
 import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,8 @@ from deworldsg_ros.recordings.folders.annotations import (
 )
 from deworldsg_ros.recordings.folders.dataset import read_json
 from deworldsg_ros.recordings.recording import Recording, open_source
-from deworldsg_ros.scene.arrays import UInt8, UInt16
+from deworldsg_ros.scene.arrays import Bool, Float64, UInt8, UInt16
+from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
 from deworldsg_ros.scene.errors import RecordingError
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.vocabulary import COCO_CLASSES, REPLICA_SSG_PREDICATES
@@ -214,3 +217,194 @@ def _seen_surface(recording: Path) -> ScanPoints:
         within = (points > np.subtract(low, BOX_MARGIN_M)) & (points < np.add(high, BOX_MARGIN_M))
         inside |= (object_ids == number) & within.all(axis=1)
     return ScanPoints(points[inside], object_ids[inside])
+
+
+# --- The annotated objects of a scan, and what a frame shows of them.
+
+# Boxes that people mark are good to about 10 cm, and the mean of a visible surface lies at one side
+# of them: a node supports an object if its mean is in the box grown by this on every side.
+MARKED_MARGIN_M = 0.3
+MAX_MARKED = 10_000
+# A surface point this far outside its object's box still is a point of the object.
+SURFACE_MARGIN_M = 0.02
+# Points along each side of a box: the part of them in the image is the part of the object there.
+GRID = 5
+NEAREST_M = 0.1
+# Depth pixels of a box that are looked at, about.
+MAX_SAMPLES = 10_000
+
+
+@dataclass(frozen=True)
+class TrueObject:
+    """An annotated object.
+
+    Attributes:
+        id: of the annotation.
+        names: classes that are right, the first for people.
+        low, high: corners (3,) of its box, metres, world.
+    """
+
+    id: str
+    names: tuple[str, ...]
+    low: Float64
+    high: Float64
+
+    @property
+    def title(self) -> str:
+        """Its first name and its id, for people."""
+        name = self.names[0]
+        return name if self.id == name else f"{name} {self.id}"
+
+    def contains(self, points_world: Float64, margin_m: float) -> Bool:
+        """Which points (..., 3) are in the box, grown by a margin on every side."""
+        inside = (points_world >= self.low - margin_m) & (points_world <= self.high + margin_m)
+        return np.asarray(inside.all(axis=-1))
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a frame shows of an object.
+
+    Attributes:
+        part: of its box in the image, 0 to 1.
+        pixels: with its surface, about.
+        box_xyxy: (4,) around these pixels; of no size without any.
+        depth_m: their median depth; inf without any.
+    """
+
+    part: float
+    pixels: float = 0.0
+    box_xyxy: Float64 = field(default_factory=lambda: np.zeros(4))
+    depth_m: float = np.inf
+
+    @property
+    def side_px(self) -> float:
+        """The shorter side of the box around the pixels."""
+        return float((self.box_xyxy[2:] - self.box_xyxy[:2]).min())
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The annotated objects of a scan.
+
+    Attributes:
+        objects: all that count.
+        margin_m: a node is at an object if its mean is in the box grown by this.
+        class_of: classes of the annotation by those labels of the detector that differ.
+        instances: instance image (H, W) of a frame with the ids of the objects; None = there is
+            none: a depth pixel in the box of an object shows the object.
+    """
+
+    objects: tuple[TrueObject, ...]
+    margin_m: float
+    class_of: Mapping[str, str] = field(default_factory=dict)
+    instances: Callable[[RgbdFrame], UInt16] | None = None
+
+    def is_right(self, row: int, label: str) -> bool:
+        """Whether a label of the detector is a name of an object."""
+        return self.class_of.get(label, label) in self.objects[row].names
+
+    def sights(self, frame: RgbdFrame) -> dict[int, Sight]:
+        """What a frame shows of each object that it has a part of, by row of `objects`."""
+        if not self.objects:
+            return {}
+        steps = np.linspace(0.0, 1.0, GRID)
+        grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+        low = np.array([item.low for item in self.objects])[:, None]
+        high = np.array([item.high for item in self.objects])[:, None]
+        T = invert_pose(frame.T_world_camera)
+        points = (low + grid * (high - low)) @ T[:3, :3].T + T[:3, 3]
+        in_front = points[..., 2] > NEAREST_M
+        points[~in_front] = 1.0
+        pixels = frame.intrinsics.project(points)
+        size = np.array([frame.intrinsics.width, frame.intrinsics.height])
+        shown = in_front & ((pixels >= 0) & (pixels <= size - 1)).all(axis=-1)
+        image = None if self.instances is None else self.instances(frame)
+        found = {}
+        for row in np.flatnonzero(shown.any(axis=1)).tolist():
+            window = pixels[row][in_front[row]]
+            found[row] = self._sight(frame, row, float(shown[row].mean()), window, image)
+        return found
+
+    def _sight(
+        self, frame: RgbdFrame, row: int, part: float, window: Float64, image: UInt16 | None
+    ) -> Sight:
+        """The pixels of an object in the window of the image around some pixels (n, 2)."""
+        height, width = frame.depth_m.shape
+        left, top = np.clip(np.floor(window.min(axis=0)), 0, [width - 1, height - 1]).astype(int)
+        right, bottom = np.clip(np.ceil(window.max(axis=0)), 0, [width - 1, height - 1]).astype(int)
+        area = (right - left + 1) * (bottom - top + 1)
+        step = max(1, int(np.sqrt(area / MAX_SAMPLES)))
+        v, u = np.mgrid[top : bottom + 1 : step, left : right + 1 : step]
+        depths = frame.depth_m[v, u].astype(np.float64)
+        if image is not None:
+            mine = image[v, u] == int(self.objects[row].id)
+        else:
+            T = frame.T_world_camera
+            points = frame.intrinsics.back_project(u, v, depths) @ T[:3, :3].T + T[:3, 3]
+            mine = self.objects[row].contains(points, SURFACE_MARGIN_M) & (depths > 0)
+        if not mine.any():
+            return Sight(part)
+        columns, rows = u[mine], v[mine]
+        box = np.array([columns.min(), rows.min(), columns.max(), rows.max()], np.float64)
+        measured = depths[mine & (depths > 0)]
+        depth_m = float(np.median(measured)) if len(measured) else np.inf
+        return Sight(part, float(len(columns) * step**2), box, depth_m)
+
+
+def middle_of(frame: RgbdFrame, box_xyxy: Float64) -> Float64:
+    """The point (3,), world, in the middle of a box (4,) of the image; NaN without depth there.
+
+    Its depth is the median of the middle third of the box.
+    """
+    centre, half = (box_xyxy[:2] + box_xyxy[2:]) / 2, (box_xyxy[2:] - box_xyxy[:2]) / 6
+    left, top = np.maximum(centre - half, 0.0).astype(int).tolist()
+    right, bottom = np.maximum(centre + half, 0.0).astype(int).tolist()
+    depths = frame.depth_m[top : bottom + 1, left : right + 1]
+    depths = depths[depths > 0].astype(np.float64)
+    if not len(depths):
+        return np.full(3, np.nan)
+    point = frame.intrinsics.back_project(centre[:1], centre[1:], np.median(depths, keepdims=True))
+    T = frame.T_world_camera
+    return np.asarray(point[0] @ T[:3, :3].T + T[:3, 3])
+
+
+def read_marked(path: Path) -> Truth:
+    """Objects of a file of boxes that somebody has marked.
+
+    The file is JSON: ``{"objects": [...]}``. Each object has ``names``, ``coco`` or ``label``, its
+    box as ``aabb`` (two corners) or as ``centroid_m`` and ``extent_m``, metres, world, and may have
+    an ``id``. Those with ``optional`` true are left out.
+
+    Raises:
+        RecordingError: the file cannot be read; the text says what is wrong with which object.
+    """
+    content = read_json(path)
+    found, number = [], 0
+    try:
+        listed = content["objects"]
+        if not 0 < len(listed) <= MAX_MARKED:
+            raise ValueError(f"{len(listed)} objects: expected 1 to {MAX_MARKED}")
+        for number, item in enumerate(listed):
+            if not item.get("optional"):
+                found.append(_marked(number, item))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        where = f"{path}: object {number}"
+        raise RecordingError(
+            f"{where}: {type(error).__name__}: {error}; expected names and a box for each object"
+        ) from error
+    return Truth(tuple(found), MARKED_MARGIN_M)
+
+
+def _marked(number: int, item: Mapping[str, Any]) -> TrueObject:
+    names = item.get("names") or [item.get("coco") or item["label"]]
+    if not (isinstance(names, list) and all(isinstance(name, str) and name for name in names)):
+        raise ValueError(f"names {names}: expected a list of words")
+    if "aabb" in item:
+        box = np.array(item["aabb"], np.float64)
+    else:
+        half = np.array(item["extent_m"], np.float64) / 2
+        box = np.array([-half, half]) + np.array(item["centroid_m"], np.float64)
+    if box.shape != (2, 3) or not np.isfinite(box).all() or (box[0] > box[1]).any():
+        raise ValueError(f"box {box.tolist()}: expected two corners, the lower one first")
+    return TrueObject(str(item.get("id", number)), tuple(names), box[0], box[1])

@@ -322,7 +322,7 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
     source = open_source(annotations.scan_folder(task.scan), options=task.dataset)
     opened.callback(source.close)
     front_end = build_front_end(task.front_end, annotations, task.scan, source, task.config)
-    pipeline = build_method(task.method, _with_relation_head(task), front_end)
+    pipeline = build_method(task.method, with_relation_head(task), front_end)
     recording = Recording(source, task.config.inputs)
     total = len(range(0, recording.frame_count, task.every))
     total = min(total, task.max_frames or total)
@@ -376,7 +376,7 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
     )
 
 
-def _with_relation_head(task: ScanTask) -> Config:
+def with_relation_head(task: ScanTask) -> Config:
     """The configuration with the name of the relation head that runs.
 
     Recorded and annotated relations do not come from the configured head: the beliefs of edges

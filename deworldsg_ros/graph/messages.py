@@ -312,6 +312,10 @@ def _colours(sums: Float64) -> list[list[float] | UnsetType]:
     return [mean if n else UNSET for mean, n in zip(means.tolist(), sums[:, 3].tolist())]
 
 
+# Why a node that was published is hidden when its object is gone.
+ABSENT = "absent from its position"
+
+
 def hidden_node(graph: GlobalGraph, node_id: int, reason: str) -> wire.HiddenNode:
     """The message of a node that is not published."""
     nodes, slot = graph.nodes, graph.nodes.slot(node_id)

@@ -8,6 +8,7 @@ from collections.abc import Collection
 import numpy as np
 
 from deworldsg_ros.graph.graph import GlobalGraph
+from deworldsg_ros.graph.messages import ABSENT
 from deworldsg_ros.merging import beliefs
 from deworldsg_ros.merging.records import NodeRecords
 from deworldsg_ros.merging.views import HALF, NOT_VISIBLE, View
@@ -198,9 +199,7 @@ class LifeCycle:
         hidden = [node_id for node_id in hidden if node_id not in edits.replaced]
         ids = [node_id for node_id in hidden if records.has(nodes.slot(node_id))]
         missed = records.are_missed(nodes.slots_of(ids), self._min_existence)
-        reasons = {
-            i: "absent from its position" if i in self._lost else "seen too little" for i in hidden
-        }
+        reasons = {i: ABSENT if i in self._lost else "seen too little" for i in hidden}
         for node_id, is_missed in zip(ids, missed.tolist()):
             reasons[node_id] = "missed by the detector" if is_missed else "seen too little"
         return {**reasons, **dict.fromkeys(edits.deleted, DELETED)}

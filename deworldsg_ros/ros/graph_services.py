@@ -57,7 +57,7 @@ class GoalNear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Explain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An object, by id or class, and for a pair a second one."""
+    """An object, by id or class, and for a pair a second one; or a class and a place."""
 
     object: int | Text
     other: int | Text | None = None
@@ -152,8 +152,9 @@ class GraphServices:
 
     def _explain(self, request: Explain) -> str:
         what = request.object if request.other is None else (request.object, request.other)
-        found = self._asked().explain(what)
-        return _json({"subject": found.subject, "lines": found.lines, **found.values})
+        graph = self._asked()
+        graph.space = self._builder.space
+        return _json(graph.explain(what).to_dict())
 
     def _edit(self, request: EditRequest) -> str:
         reply = self._builder.edit(request)

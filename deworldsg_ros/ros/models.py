@@ -21,6 +21,7 @@ from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.relations.clips import PublishedGraph
 from deworldsg_ros.relations.stage import EvidenceWorker, RelationReasoner, build_world_model
 from deworldsg_ros.relations.world_model import require_predicates
+from deworldsg_ros.ros.health import TURNED
 from deworldsg_ros.ros.inputs import (
     WANTED_DEPTH,
     listen_camera_info,
@@ -31,7 +32,6 @@ from deworldsg_ros.ros.inputs import (
 )
 from deworldsg_ros.ros.joining import MAX_BUSY_S, JoiningNode
 from deworldsg_ros.ros.node import StageNode
-from deworldsg_ros.ros.statuses import TURNED
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import RelationEvidence
 from deworldsg_ros.streams.frames import FrameAssembler, PairingFrame

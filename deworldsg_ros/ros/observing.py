@@ -20,8 +20,8 @@ from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
 from deworldsg_ros.doctor import Observations
+from deworldsg_ros.ros.health import listened, observations_of
 from deworldsg_ros.ros.qos import best_effort, source
-from deworldsg_ros.ros.statuses import listened, observations_of
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import stamp_ns_of
 

@@ -65,6 +65,61 @@ def test_an_object_without_a_name(small):
     assert "no class is probable enough for a name: cup 40%; all others 60%" in said
 
 
+class SeenLeft:
+    """Space where all before y = 5 was seen: free, but for the floor."""
+
+    def look(self, points):
+        seen, low = points[:, 1] < 5.0, points[:, 2] < 0.5
+        return seen & ~low, seen & low
+
+
+def test_what_is_known_of_a_place(small):
+    def known(text, graph):
+        return graph.explain(text).values["known"]
+
+    def hidden(label, x, reason):
+        return wire.HiddenNode(label, [x, 0.0, 0.5], 0.3, 4, reason)
+
+    unnamed = make_node(
+        9, "object", (-3.0, 0.0, 0.4), named=False, classes=[wire.Belief("chair", 0.4)]
+    )
+    message = msgspec.structs.replace(
+        small.message,
+        nodes=[*small.message.nodes, unnamed],
+        hidden=[
+            hidden("chair", 5.0, "seen too little"),
+            hidden("cup", 7.0, "absent from its position"),
+        ],
+    )
+    graph = SceneGraph(message)
+    graph.space = SeenLeft()
+    found = graph.explain("chair near (1.1, 0.1)")
+    assert found.subject == "chair near (1.10, 0.10), within 1 m: chair #3 is there"
+    assert [item["id"] for item in found.values["objects"]] == [3, 2]
+    assert known("chair near (0, 0) within 20 cm", graph).startswith("other objects are there")
+    assert "a chair with 0%" in str(graph.explain("chair near (0, 0) within 20 cm"))
+    assert known("chair near (-3, 0)", graph) == "object #9 may be it"
+    assert "no class is probable enough" in str(graph.explain("chair near (-3, 0)"))
+    assert known("chair near (5.2, 0)", graph) == "hidden: seen too little"
+    gone = "removed: absent from its position"
+    assert known("chair near (7, 0)", graph) == f"something else there is {gone}"
+    assert known("cup near (7, 0)", graph) == known("anything near (7, 0)", graph) == gone
+    assert known("anything near (-3, 0)", graph) == "object #9 is there"
+    assert known("cup near (-9, 0)", graph) == "nothing was detected there, though it was in view"
+    assert known("cup near (-9, 40)", graph) == "never in view"
+    assert "100% never in view" in str(graph.explain("cup near (-9, 40)"))
+    # With three numbers the height counts, and without a height none does.
+    assert known("chair near (1.2, 0, 4)", graph) != known("chair near (1.2, 0)", graph)
+    # A copy of the topics knows neither hidden objects nor space.
+    told = str(small.explain("cup near (-9, 40) within 0.5 m"))
+    assert "not in this message" in told and "not known here" in told
+    # In a world with y up, two numbers are x and z.
+    tall = SceneGraph(msgspec.structs.replace(small.message, up=[0.0, 1.0, 0.0]))
+    assert known("chair near (1.2, 0.45) within 5 cm", tall) == "chair #3 is there"
+    with pytest.raises(ClientError, match="'xyzzy'"):
+        graph.explain("xyzzy near (0, 0)")
+
+
 def test_relations_from_both_ends_and_paths(small):
     assert [i.text for i in small.relations("cup", "on")] == ["cup #1 standing on dining table #2"]
     assert small.relations("cup", "lying on") == []

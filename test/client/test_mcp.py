@@ -76,6 +76,8 @@ def test_changes_are_told_from_the_first_question_on(room):
 def test_empty_and_unknown_arguments(room):
     tools = GraphTools(lambda: room)
     assert tools.get_object_context("elephant")
+    told = tools.get_object_context("cup near (90, 90)")["explanation"]
+    assert told.startswith("cup near (90.00, 90.00), within 1 m: nothing was detected there")
     with pytest.raises(ClientError, match="an id or a class"):
         tools.goal_near(" ")
     assert tools.list_relations(limit=0)["relations"] == []

@@ -174,6 +174,10 @@ def test_questions_are_answered_and_a_goal_is_published_on_request_only(robot, c
     assert found["answers"][0]["object"]["id"] == 1
     reason = robot.ask(client.command, "explain", object="cup")
     assert reason["lines"][0] == "detected in 5 frames over 0.4 s"
+    place = robot.ask(client.explain, "cup near (50, 50)")
+    assert place["known"] == "never in view" and place["hidden"] == []
+    live = robot.command("explain", "--live", "cup near (50, 50)")
+    assert live.startswith("cup near (50.00, 50.00), within 1 m: never in view")
     goals = robot.peer.listen(PoseStamped, "deworldsg/goal", 1)
     robot.node.graph.builder.space = WallAlongX()
     assert client.graph.goal_near("cup", 0.8).seen_free is None

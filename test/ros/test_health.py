@@ -14,10 +14,10 @@ from deworldsg_ros.ros.health import (
     Health,
     count_in,
     counts_in,
+    observations_of,
     received_in,
 )
 from deworldsg_ros.ros.node import DropLog
-from deworldsg_ros.ros.statuses import observations_of
 
 
 @pytest.fixture
