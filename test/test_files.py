@@ -1,6 +1,7 @@
 """Files are written whole or not at all."""
 
 import os
+import signal
 import stat
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -70,15 +71,15 @@ def test_a_link_stays_and_the_file_that_it_names_is_replaced(tmp_path):
     assert names(tmp_path / "disk") == ["a.map"]
 
 
-def test_a_pipe_is_written_and_not_replaced(tmp_path):
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    read: list[bytes] = []
-    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()))
-    reader.start()
-    files.write_atomically(pipe, b"graph")
-    reader.join(5)
-    assert read == [b"graph"] and names(tmp_path) == ["pipe"]
+@pytest.mark.parametrize("name", ["pipe", "link"])
+def test_a_pipe_is_refused_and_does_not_block(tmp_path, name):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    writers = [files.write_atomically, lambda path, _: files.check_writable(path)]
+    for write in [*writers, lambda path, _: files.together(path.parent, [name]).__enter__()]:
+        with pytest.raises(OSError, match="pipe or a device: expected a regular file"):
+            write(tmp_path / name, b"graph")
+    assert names(tmp_path) == ["link", "pipe"]
 
 
 def test_the_file_before_stays_under_its_name(tmp_path):
@@ -129,22 +130,90 @@ def test_a_name_that_is_a_folder_is_refused_at_the_start(tmp_path):
         pytest.fail("the run has begun")
 
 
-def test_a_kill_between_two_renames_is_completed_by_the_next_run(tmp_path):
+def temporary(folder: Path, suffix: str, number: int = 1) -> Path:
+    return folder / f"{files.PREFIX}{number:032x}{suffix}"
+
+
+# Before the kill; of seven: four old files away, three new ones in.
+@pytest.mark.parametrize("moves", range(7))
+def test_a_kill_between_two_renames_is_undone_or_completed_by_the_next_run(
+    tmp_path, moves, monkeypatch
+):
     write_run(tmp_path, 2)
-    # As it is left: complete, one file is in place, one is to be removed.
-    ready = tmp_path / f"{files.PREFIX}x{files.READY}"
-    (ready / "config.yaml").mkdir(parents=True)
-    (tmp_path / "graph.png").unlink()
-    (tmp_path / "graph.json").write_bytes(b"00003" * 2000)
-    for name in ("graph.png", "run.json"):
-        (ready / name).write_bytes(b"00003" * 2000)
+    real, left = Path.rename, iter(range(moves))
+
+    def rename(path, target):
+        is_move = path.suffix != files.PARTIAL and files.READY in f"{path}{target}"
+        if is_move and next(left, None) is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(path, target)
+
+    def write():
+        monkeypatch.setattr(Path, "rename", rename)
+        write_run(tmp_path, 5)
+
+    killed(write, 0.3)
+    assert len(run_in(tmp_path)) <= 1
     files.remove_left_overs(tmp_path)
-    assert run_in(tmp_path) == {b"00003"} and names(tmp_path) == [*FILES[1:]]
+    run = 2 if moves < 4 else 5
+    assert run_in(tmp_path) == {b"%05d" % run} and names(tmp_path) == [*FILES[run % 2 :]]
+
+
+def plant(folder: Path, ready: Path) -> None:
+    """What a run leaves: a file for a place that is taken, and a link for a free one."""
+    ready.mkdir(mode=0o700)
+    (ready / "room.map").write_text("theirs")
+    (ready / "graph.json").symlink_to("/etc/passwd")
+    (folder / "room.map").write_text("ours")
+
+
+@pytest.mark.parametrize("where", ["here", "owner", "mode", "name", "link"])
+def test_what_others_plant_replaces_nothing(tmp_path, where):
+    folder, elsewhere = tmp_path / "shared", tmp_path / "elsewhere"
+    folder.mkdir()
+    ready = temporary(folder, files.READY)
+    if where == "link":
+        plant(folder, elsewhere)
+        ready.symlink_to(elsewhere)
+    else:
+        ready = ready if where != "name" else folder / f"{files.PREFIX}x{files.READY}"
+        plant(folder, ready)
+    if where == "mode":
+        ready.chmod(0o777)
+    if where == "owner":
+        if os.geteuid():
+            pytest.skip("needs root, to give a folder away")
+        (folder / "room.map").unlink()  # not even a free place is taken
+        os.chown(ready, 12345, 12345)
+    before = set(names(folder))
+    files.write_atomically(folder / "b", b"b")
+    assert (folder / "room.map").exists() == (where != "owner")
+    assert where == "owner" or (folder / "room.map").read_text() == "ours"
+    # Only what this user alone can have left is removed.
+    assert set(names(folder)) == {*before, "b"} - ({ready.name} if where == "here" else set())
+
+
+@pytest.mark.parametrize("planted", ["link", "hard link", "owner"])
+def test_a_planted_lock_is_refused_and_what_it_names_stays(tmp_path, planted):
+    mine, lock = tmp_path / "mine", tmp_path / ".a.map.lock"
+    mine.write_text("mine")
+    if planted == "link":
+        lock.symlink_to(mine)
+    elif planted == "hard link":
+        os.link(mine, lock)
+    elif os.geteuid():
+        pytest.skip("needs root, to give a file away")
+    else:
+        mine.rename(lock)
+        os.chown(lock, 12345, 12345)
+    with pytest.raises(OSError, match="symbolic links|not this user's own"):
+        files.FileLock(tmp_path / "a.map")
+    assert lock.read_text() == "mine"
 
 
 def test_what_a_living_process_writes_is_no_left_over(tmp_path):
-    (tmp_path / f"{files.PREFIX}dead{files.PARTIAL}").write_text("half")
-    (tmp_path / f"{files.PREFIX}dead2{files.PARTIAL}").mkdir()
+    temporary(tmp_path, files.PARTIAL).write_text("half")
+    temporary(tmp_path, files.PARTIAL, 2).mkdir(mode=0o700)
     with files.temporary_folder(tmp_path) as folder:
         (folder / "a").write_text("a")
         files.write_atomically(tmp_path / "b", b"b")

@@ -104,11 +104,18 @@ def paused_collector() -> Iterator[None]:
 # Everything the package writes goes through `write_atomically` (one file) or `together` (the files
 # of one run). Temporary names begin with PREFIX and lie beside their target: a rename is atomic
 # only within one file system. Each is locked by its writer. A temporary name without a lock belongs
-# to a dead process, and the next writer in that folder removes it.
+# to a dead process, and the next writer in that folder removes it, if it is its own user's: others
+# may write in the folder, too. What a dead process has left never replaces a file.
 
 PREFIX = ".deworldsg-"
 # Suffixes of temporary names: a file or folder in work, and a folder whose files are complete.
 PARTIAL, READY = ".partial", ".ready"
+_TEMPORARY = re.compile(rf"{re.escape(PREFIX)}[0-9a-f]{{32}}({PARTIAL}|{READY})")
+# In a folder whose files are complete: what they replace.
+_OLD = ".old"
+
+# Text that spreadsheets may take for a formula, also after blanks and in full-width characters.
+_FORMULA = re.compile(r"\s*[=+\-@＝＋－＠]|[\t\r\n]")
 
 Content = bytes | str | Callable[[BinaryIO], object]
 
@@ -124,13 +131,11 @@ def write_atomically(path: Path, content: Content, *, previous: Path | None = No
         previous: name in the same folder under which the old file stays; None = it does not.
 
     Raises:
-        OSError: if the file cannot be written. Errors of `content` pass through.
+        OSError: if the file cannot be written, or the path is no regular file. Errors of `content`
+            pass through.
     """
+    _check_regular(path)
     path = Path(os.path.realpath(path))
-    if path.exists() and not path.is_file() and not path.is_dir():
-        with path.open("wb") as file:  # a pipe or a terminal, such as /dev/stdout
-            _write(file, content)
-        return
     remove_left_overs(path.parent)
     partial, descriptor = _new(path.parent, _make_file)
     with os.fdopen(descriptor, "wb") as file:
@@ -147,19 +152,37 @@ def write_atomically(path: Path, content: Content, *, previous: Path | None = No
     _sync(path.parent)
 
 
-def write_csv(path: Path, lines: Iterable[Sequence[object]]) -> None:
-    """Write lines of cells as a CSV file; raises OSError."""
+def csv_text(lines: Iterable[Sequence[object]], end: str = "\r\n") -> str:
+    """Lines of cells as CSV; a spreadsheet takes no text of them for a formula.
+
+    A text that could begin one gets an apostrophe, by which spreadsheets know text; text that
+    writes a number stays as it is.
+    """
     text = io.StringIO(newline="")
-    csv.writer(text).writerows(lines)
-    write_atomically(path, text.getvalue())
+    csv.writer(text, lineterminator=end).writerows(map(_as_data, line) for line in lines)
+    return text.getvalue()
+
+
+def _as_data(cell: object) -> object:
+    if not isinstance(cell, str) or not _FORMULA.match(cell):
+        return cell
+    with suppress(ValueError):
+        float(cell)
+        return cell
+    return f"'{cell}"
+
+
+def write_csv(path: Path, lines: Iterable[Sequence[object]]) -> None:
+    """Write lines of cells as a CSV file, as `csv_text`; raises OSError."""
+    write_atomically(path, csv_text(lines))
 
 
 @contextmanager
 def together(folder: Path, names: Iterable[str]) -> Iterator[Path]:
     """The files of one run: all of them are put in place at the end, or none.
 
-    A kill never leaves files of two runs side by side: the old files are removed before the new
-    ones are moved. If that is interrupted, the next `together` in the folder completes it.
+    A kill never leaves files of two runs side by side: the old files are moved away before the new
+    ones are moved in. If that is interrupted, the next writer in the folder undoes or completes it.
 
     Args:
         folder: for the files; it is made if it is missing. Its other files stay.
@@ -175,8 +198,7 @@ def together(folder: Path, names: Iterable[str]) -> Iterator[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     folder, names = Path(os.path.realpath(folder)), set(names)
     for name in names:
-        if (folder / name).is_dir():
-            raise IsADirectoryError(errno.EISDIR, "is a folder: expected a file", folder / name)
+        _check_regular(folder / name)
     with temporary_folder(folder) as staged:
         yield staged
         for path in staged.iterdir():
@@ -202,18 +224,16 @@ def temporary_folder(parent: Path) -> Iterator[Path]:
 
 
 def remove_left_overs(folder: Path) -> None:
-    """Complete or remove what dead processes have left in a folder."""
-    with suppress(OSError), os.scandir(folder) as entries:
-        left = [Path(entry.path) for entry in entries if entry.name.startswith(PREFIX)]
-        for path in left:
-            with suppress(OSError), _opened(path) as descriptor:
+    """Complete, undo or remove what dead processes of this user have left in a folder."""
+    folder = Path(os.path.realpath(folder))
+    with suppress(OSError), _opened(folder) as parent:
+        with os.scandir(parent) as entries:
+            names = [entry.name for entry in entries if _TEMPORARY.fullmatch(entry.name)]
+        for name in names:
+            with suppress(OSError), _opened(name, parent) as descriptor:
                 _lock(descriptor)
-                if path.suffix == READY:
-                    _place(path)
-                elif path.is_dir():
-                    shutil.rmtree(path, ignore_errors=True)
-                else:
-                    path.unlink()
+                if _is_own(descriptor) and _is_at(descriptor, folder / name):
+                    _recover(folder / name)
 
 
 def confined(folder: Path, name: str | Path) -> Path:
@@ -256,8 +276,7 @@ def check_writable(path: Path) -> None:
     Raises:
         OSError: if it cannot.
     """
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, "is a folder: expected a file", path)
+    _check_regular(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with temporary_folder(Path(os.path.realpath(path)).parent):
         pass
@@ -285,8 +304,11 @@ class FileLock:
         self._file = self._path.with_name(f".{self._path.name}.lock")
         self._descriptor: int | None = None
         while self._descriptor is None:
-            descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT, 0o666)
+            descriptor = os.open(self._file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
             try:
+                if not _is_own(descriptor):
+                    message = f"its lock {self._file} is not this user's own: take another path"
+                    raise PermissionError(errno.EPERM, message, path)
                 _lock(descriptor)
                 # Whoever held it before may have removed the file since it was opened.
                 if _is_at(descriptor, self._file):
@@ -396,7 +418,7 @@ def _make_file(path: Path) -> int:
 
 
 def _make_folder(path: Path) -> int:
-    path.mkdir()
+    path.mkdir(mode=0o700)
     return os.open(path, os.O_RDONLY)
 
 
@@ -415,32 +437,79 @@ def _lock(descriptor: int, *, wait: bool = False) -> None:
 def _is_at(descriptor: int, path: Path) -> bool:
     """Whether an open file still has this name."""
     try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
+        return os.path.samestat(os.fstat(descriptor), path.lstat())
     except FileNotFoundError:
         return False
 
 
+def _is_own(descriptor: int) -> bool:
+    """Whether only this user can have made an open file, or put files into an open folder."""
+    status = os.fstat(descriptor)
+    if stat.S_ISDIR(status.st_mode):
+        private = not status.st_mode & 0o077
+    else:
+        private = stat.S_ISREG(status.st_mode) and status.st_nlink <= 1
+    return private and status.st_uid == os.geteuid()
+
+
+def _check_regular(path: Path) -> None:
+    """Raise OSError for a path that is there and no regular file; a pipe would block."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "is a folder: expected a file", path)
+    if path.exists() and not path.is_file():
+        problem = "it is a pipe or a device: expected a regular file"
+        raise OSError(errno.EINVAL, problem, path)
+
+
 def _place(ready: Path) -> None:
     """Move complete files to the folder above; the descriptor of `ready` is locked."""
-    folder = ready.parent
+    folder, old = ready.parent, ready / _OLD
     with _opened(folder) as descriptor:
         _lock(descriptor, wait=True)  # two runs that end at one time do not mix
         complete = list(ready.iterdir())
+        old.mkdir()
         for path in complete:
-            (folder / path.name).unlink(missing_ok=True)
-        for path in complete:
-            if path.is_dir():
-                path.rmdir()
-            else:
-                path.rename(folder / path.name)
-        ready.rmdir()
+            with suppress(FileNotFoundError):
+                (folder / path.name).rename(old / path.name)
+        _move_files(complete, folder)
+        shutil.rmtree(ready)
         _sync(folder)
 
 
+def _recover(left: Path) -> None:
+    """End what a dead process has begun; the descriptor of `left` is locked.
+
+    No file of the folder is replaced: a complete file whose place is taken means that its process
+    died while it moved the old files away, and they come back.
+    """
+    folder = left.parent
+    with _opened(folder) as descriptor:
+        _lock(descriptor, wait=True)
+        if left.suffix == READY:
+            new = [path for path in left.iterdir() if path.name != _OLD]
+            undo = any(os.path.lexists(folder / path.name) for path in new)
+            moved = list((left / _OLD).iterdir()) if undo and (left / _OLD).is_dir() else []
+            free = [path for path in moved if not os.path.lexists(folder / path.name)]
+            _move_files(free if undo else new, folder)
+            _sync(folder)
+        if left.is_dir():
+            shutil.rmtree(left)
+        else:
+            left.unlink()
+
+
+def _move_files(paths: Iterable[Path], folder: Path) -> None:
+    """Move regular files; an empty folder stands for "no such file"."""
+    for path in paths:
+        if stat.S_ISREG(path.lstat().st_mode):
+            path.rename(folder / path.name)
+
+
 @contextmanager
-def _opened(path: Path) -> Iterator[int]:
+def _opened(path: Path | str, parent: int | None = None) -> Iterator[int]:
     with ExitStack() as stack:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+        descriptor = os.open(path, flags, dir_fd=parent)
         stack.callback(os.close, descriptor)
         yield descriptor
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Callable
@@ -12,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from deworldsg_ros.base.files import write_atomically
+from deworldsg_ros.base.files import csv_text, write_atomically
 from deworldsg_ros.base.words import visible
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
@@ -192,11 +190,7 @@ def _relation_rows(graph: SceneGraph) -> list[dict[str, object]]:
 
 
 def _csv(columns: tuple[str, ...], rows: list[dict[str, object]]) -> bytes:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue().encode()
+    return csv_text([columns, *([row[name] for name in columns] for row in rows)], "\n").encode()
 
 
 def _splat(item: SceneObject) -> list[float]:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 from xml.etree import ElementTree
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from support.view import make_edge, make_graph, make_node
 
+from deworldsg_ros.base.files import write_csv
 from deworldsg_ros.client import ClientError, SceneGraph
 from deworldsg_ros.client.export import FORMATS, SPARK_SYMBOL, export
 from deworldsg_ros.scene.camera import pose_from_quaternion
@@ -81,6 +83,24 @@ def test_spark_dsg_reads_its_json(room, tmp_path):
     edge = graph.get_edge(SPARK_SYMBOL + 13, SPARK_SYMBOL + 5)
     assert edge.info.weight == pytest.approx(0.992)
     assert edge.info.metadata.get()["relations"][0]["predicate"] == "on"
+
+
+@pytest.mark.parametrize("mark", [*"=+-@＝", " ="])
+def test_no_cell_is_a_formula_and_numbers_stay(tmp_path, mark):
+    name = f"{mark}cmd|'/c calc'!A0"
+    node = make_node(1, name, (-1.5, 0, 0))
+    (first, _) = export(SceneGraph(make_graph([node])), "csv", tmp_path / "graph.csv")
+    (row,) = csv.DictReader(first.open(encoding="utf-8"))
+    assert (row["label"], float(row["x"])) == (f"'{name}", -1.5)
+    write_csv(tmp_path / "more.csv", [[f"\t{name}", -2, "-0.5", "cup"]])
+    (cells,) = csv.reader((tmp_path / "more.csv").open(newline="", encoding="utf-8"))
+    assert cells == [f"'\t{name}", "-2", "-0.5", "cup"]
+
+
+def test_export_to_a_pipe_is_refused_and_does_not_block(room, tmp_path):
+    os.mkfifo(tmp_path / "graph.csv")
+    with pytest.raises(ClientError, match=r"graph\.csv cannot be written: it is a pipe"):
+        export(room, "csv", tmp_path / "graph.csv")
 
 
 def test_names_are_text_in_every_format(tmp_path):
