@@ -226,7 +226,8 @@ def view(
     host: Annotated[
         str,
         typer.Option(
-            "--host", help="address of the page; 0.0.0.0 lets other machines see the images, too"
+            "--host",
+            help="address of the page; with 0.0.0.0, who has the link sees the images anywhere",
         ),
     ] = "127.0.0.1",
     port: Annotated[

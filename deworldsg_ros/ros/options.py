@@ -95,7 +95,8 @@ class ViewerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The page of viewer_node."""
 
     host: Annotated[
-        str, option("address of the page; 0.0.0.0 lets other machines see the images, too")
+        str,
+        option("address of the page; with 0.0.0.0, who has the link sees the images anywhere"),
     ] = "127.0.0.1"
     port: Annotated[
         int,

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+import http.client
+import io
+import secrets
 import threading
 from collections.abc import Collection, Iterable
+from concurrent.futures import Future
+from contextlib import closing, suppress
 
 import foxglove
 import numpy as np
@@ -17,7 +23,7 @@ from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.view.colours import QUIET, class_colours, to_rgb
 from deworldsg_ros.view.live.camera import CameraView, jpeg, with_masks
 from deworldsg_ros.view.live.details import in_words
-from deworldsg_ros.view.live.state import up_of
+from deworldsg_ros.view.live.state import Guard, up_of
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import GraphReplica
 
@@ -26,6 +32,12 @@ OBJECTS, RELATIONS, NEAR = "/scene_graph/objects", "/scene_graph/relations", "/s
 IMAGE, TRANSFORMS, CAMERA_FRAME = "/camera/image", "/tf", "deworldsg_camera"
 TEXT_PX, SHAFT_M, HEAD_M, HEAD_LENGTH_M = 12.0, 0.012, 0.035, 0.06
 OPACITY, RELATION_RGBA = 0.4, (0.95, 0.75, 0.2, 0.9)
+
+# Of its web application and of its desktop; and of Lichtblick, on this machine.
+ORIGINS = ("https://app.foxglove.dev", "file://", Guard.LOCAL)
+# The head of a request is no longer, in bytes and in time.
+HEAD_BYTES, HEAD_S = 16_384, 10.0
+BLOCK_BYTES = 65_536
 
 
 class FoxgloveServer(foxglove.ServerListener):
@@ -36,7 +48,8 @@ class FoxgloveServer(foxglove.ServerListener):
         port: of the WebSocket; 0 = a free one.
 
     Attributes:
-        url: of the WebSocket.
+        url: of the WebSocket, with its secret.
+        guard: refuses who does not know the secret.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -51,10 +64,19 @@ class FoxgloveServer(foxglove.ServerListener):
         }
         self._image = channels.CompressedImageChannel(IMAGE, context=self._context)
         self._transforms = channels.FrameTransformChannel(TRANSFORMS, context=self._context)
+        # The SDK asks for neither origin nor secret. Its server has one of 2^24 addresses of this
+        # machine, with a port of 2^15, which no page finds; others come through the gate.
+        inner = "127." + ".".join(str(1 + secrets.randbelow(254)) for _ in range(3))
         self._server = foxglove.start_server(
-            name="DeWorldSG", host=host, port=port, server_listener=self, context=self._context
+            name="DeWorldSG", host=inner, port=0, server_listener=self, context=self._context
         )
-        self.url = f"ws://{host}:{self._server.port}"
+        self.guard = Guard(host, "ws", ORIGINS)
+        try:
+            self._gate = Gate(host, port, (inner, self._server.port), self.guard)
+        except OSError:
+            self._server.stop()
+            raise
+        self.url = self.guard.url(self._gate.port)
 
     @property
     def session(self) -> str | None:
@@ -113,6 +135,7 @@ class FoxgloveServer(foxglove.ServerListener):
 
     def close(self) -> None:
         """End the server."""
+        self._gate.close()
         self._server.stop()
 
     def _send_all(self) -> None:
@@ -232,3 +255,75 @@ def _quaternion(values: Iterable[float]) -> messages.Quaternion:
 
 def _stamp(stamp_ns: int) -> messages.Timestamp:
     return messages.Timestamp(*divmod(stamp_ns, 10**9))
+
+
+class Gate:
+    """Passes connections that a guard lets in to a server; refuses others with 403.
+
+    Args:
+        host: address to listen on.
+        port: to listen on; 0 = a free one.
+        inner: address and port of the server.
+        guard: is asked once a connection.
+
+    Attributes:
+        port: it listens on.
+
+    Raises:
+        OSError: if this machine cannot listen there.
+    """
+
+    def __init__(self, host: str, port: int, inner: tuple[str, int], guard: Guard) -> None:
+        self._inner, self._guard = inner, guard
+        self._stop = asyncio.Event()
+        started: Future[tuple[asyncio.AbstractEventLoop, int]] = Future()
+        work = self._run(host, port, started)
+        self._thread = threading.Thread(target=asyncio.run, args=[work], name="gate", daemon=True)
+        self._thread.start()
+        self._loop, self.port = started.result()
+
+    def close(self) -> None:
+        """End all connections."""
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(timeout=5.0)
+
+    async def _run(
+        self, host: str, port: int, started: Future[tuple[asyncio.AbstractEventLoop, int]]
+    ) -> None:
+        try:
+            server = await asyncio.start_server(self._serve, host, port, limit=HEAD_BYTES)
+        except OSError as error:
+            started.set_exception(error)
+            return
+        started.set_result((asyncio.get_running_loop(), server.sockets[0].getsockname()[1]))
+        await self._stop.wait()
+        server.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        # Besides what a connection ends with: no request, or none that is HTTP.
+        ends = (OSError, EOFError, ValueError, asyncio.LimitOverrunError, asyncio.TimeoutError)
+        with closing(writer), suppress(*ends, http.client.HTTPException):
+            head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HEAD_S)
+            line, _, fields = head.partition(b"\r\n")
+            method, target, version = line.decode("latin-1").split(" ")
+            path = self._guard.path(target, http.client.parse_headers(io.BytesIO(fields)))
+            if path is None:
+                writer.write(b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n")
+                writer.write(b"Connection: close\r\n\r\n")
+                await writer.drain()
+                return
+            from_inner, to_inner = await asyncio.open_connection(*self._inner)
+            with closing(to_inner):
+                to_inner.write(f"{method} {path} {version}\r\n".encode("latin-1") + fields)
+                both = _pump(reader, to_inner), _pump(from_inner, writer)
+                tasks = [asyncio.ensure_future(pump) for pump in both]
+                _, others = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+                for task in others:
+                    task.cancel()
+
+
+async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    with suppress(OSError):
+        while block := await reader.read(BLOCK_BYTES):
+            writer.write(block)
+            await writer.drain()

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
-import ipaddress
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import viser
+import websockets.asyncio.server as websocket_server
 
 from deworldsg_ros.graph.extent import horizontal_axes
+from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.view.live.camera import CameraView
 from deworldsg_ros.view.live.details import object_html
 from deworldsg_ros.view.live.drawing import Label
@@ -26,7 +28,7 @@ from deworldsg_ros.view.live.scene import (
     overview,
     set_theme,
 )
-from deworldsg_ros.view.live.state import LiveState, LogOnce, OnError, up_of
+from deworldsg_ros.view.live.state import Guard, LiveState, LogOnce, OnError, up_of
 from deworldsg_ros.wire import messages as wire
 
 # Updates come at up to 30 Hz; a browser shows them at this rate, and surface points more seldom.
@@ -53,16 +55,22 @@ class Viewer:
             log gets the first one of each type.
 
     Attributes:
-        url: of the page.
+        url: of the page, with its secret.
+        guard: refuses who does not know the secret.
     """
 
     def __init__(
         self, host: str, port: int, why_empty: str, on_error: OnError | None = None
     ) -> None:
         self._on_error = LogOnce() if on_error is None else on_error
-        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table
+        self.guard = Guard(host, "http")
+        quiet = contextlib.redirect_stdout(io.StringIO())  # viser prints a table
+        with quiet, _guarded(self.guard) as guarded:
             self._server = viser.ViserServer(host, port, label="DeWorldSG", verbose=False)
-        self.url = f"http://{_reachable(host)}:{self._server.get_port()}"
+        if not guarded:
+            self._server.stop()
+            raise ConfigurationError(f"viser {viser.__version__} cannot be guarded: expected 1.1")
+        self.url = self.guard.url(self._server.get_port())
         self._lock = threading.RLock()
         self._state = LiveState(why_empty=why_empty)
         self._views: deque[CameraView] = deque(maxlen=WAITING_VIEWS)
@@ -228,9 +236,44 @@ class Viewer:
         self._fitted[client.client_id] = (position, bounds, aspect)
 
 
-def _reachable(host: str) -> str:
-    """A name for the link: an address that means all of this machine's leads nowhere."""
-    with contextlib.suppress(ValueError):
-        if ipaddress.ip_address(host).is_unspecified:
-            return "localhost"
-    return host
+_GUARDING = threading.Lock()
+
+
+@contextlib.contextmanager
+def _guarded(guard: Guard) -> Iterator[list[Guard]]:
+    """The server of viser that is made in the block asks a guard before each page and socket.
+
+    viser has no way to say so. Its constructor returns when `serve` was called in its thread.
+
+    Yields:
+        a list that has the guard afterwards, if it was asked for.
+    """
+    module: Any = websocket_server
+    serve, guarded = module.serve, []
+
+    def guarded_serve(
+        *arguments: Any, process_request: Callable[..., Any] | None = None, **options: Any
+    ) -> Any:
+        if process_request is None:  # not viser's
+            return serve(*arguments, **options)
+
+        def process(connection: Any, request: Any) -> Any:
+            path = guard.path(request.path, request.headers)
+            if path is None:
+                return connection.respond(403, "open the address that the program printed\n")
+            response = process_request(connection, dataclasses.replace(request, path=path))
+            if response is not None:
+                response.headers["Referrer-Policy"] = "no-referrer"  # it would tell the secret
+                response.headers["Cache-Control"] = "no-store"
+                response.headers["X-Frame-Options"] = "DENY"
+            return response
+
+        guarded.append(guard)
+        return serve(*arguments, process_request=process, **options)
+
+    with _GUARDING:
+        module.serve = guarded_serve
+        try:
+            yield guarded
+        finally:
+            module.serve = serve

@@ -1,10 +1,16 @@
-"""The state of a viewer, without a browser: what was recorded, and what of it is shown."""
+"""The state of a viewer, without a browser: what was recorded, and what of it is shown to whom."""
 
 from __future__ import annotations
 
+import ipaddress
 import logging
+import secrets
+import socket
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -286,3 +292,88 @@ def up_of(replica: GraphReplica) -> Point:
     """Unit vector against gravity; +z if the messages do not tell it."""
     up = replica.up
     return DEFAULT_UP if up is None else (up[0], up[1], up[2])
+
+
+# --- Who may see it.
+
+
+class Guard:
+    """Lets in whoever has the address that a server prints; web pages of others stay outside.
+
+    Args:
+        host: address that the server listens on.
+        scheme: http or ws.
+        origins: of pages that may connect beside the server's own; `LOCAL` = any of this machine.
+
+    Attributes:
+        refused: number of refused requests by reason: host, origin, token.
+    """
+
+    LOCAL = "local"
+
+    def __init__(self, host: str, scheme: str, origins: tuple[str, ...] = ()) -> None:
+        name = socket.gethostname().lower()
+        self._names = {"localhost", name, f"{name}.local", host.lower()} - {""}
+        self._host, self._scheme, self._origins = host, scheme, origins
+        self._path = f"/{secrets.token_urlsafe(16)}"
+        self.refused: Counter[str] = Counter()
+
+    def url(self, port: int) -> str:
+        """The address to print; its path is a secret of 128 bits."""
+        host = self._host
+        address = _address(host)
+        if address is not None and address.is_unspecified:
+            host = "localhost"  # an address that means all of this machine's leads nowhere
+        host = f"[{host}]" if ":" in host else host
+        return f"{self._scheme}://{host}:{port}{self._path}"
+
+    def path(self, target: str, headers: Any) -> str | None:
+        """The path of a request without the secret; None for a request to refuse, with 403.
+
+        Args:
+            target: path and query of the request.
+            headers: of the request, with `get_all` by name.
+        """
+        hosts, origins = (headers.get_all(name) or [] for name in ("Host", "Origin"))
+        rest = target[len(self._path) :]
+        given = target[: len(self._path)].encode(errors="replace")
+        if len(hosts) != 1 or not self._is_here(hosts[0]):
+            problem = "host"
+        elif not all(self._is_known(origin, hosts[0]) for origin in origins):
+            problem = "origin"
+        elif not secrets.compare_digest(given, self._path.encode()) or rest[:1] not in "/?":
+            problem = "token"
+        else:
+            return rest if rest.startswith("/") else f"/{rest}"
+        if not self.refused[problem]:
+            text = "live view: refused a request (%s): open the printed address; more are counted"
+            logging.getLogger(__name__).warning(text, problem)
+        self.refused[problem] += 1
+        return None
+
+    def _is_here(self, host: str) -> bool:
+        """Whether a name is no other machine's. A page can rebind a name, but no address."""
+        name = _name_of(f"//{host}")
+        return name in self._names or _address(name) is not None
+
+    def _is_known(self, origin: str, host: str) -> bool:
+        if origin in (f"http://{host}", f"https://{host}", *self._origins):
+            return True
+        name = _name_of(origin)
+        address = _address(name)
+        is_local = name == "localhost" or (address is not None and address.is_loopback)
+        return is_local and self.LOCAL in self._origins
+
+
+def _name_of(url: str) -> str:
+    try:
+        return urlsplit(url).hostname or ""
+    except ValueError:
+        return ""
+
+
+def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    try:
+        return ipaddress.ip_address(name)
+    except ValueError:
+        return None

@@ -1,10 +1,12 @@
 """The servers of the page and for Foxglove: where they listen, and that they go on."""
 
+import contextlib
 import socket
 import threading
 from contextlib import closing, nullcontext
 from types import SimpleNamespace
 from unittest.mock import DEFAULT, create_autospec
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402  after t
 from deworldsg_ros.view.live import sources  # noqa: E402
 from deworldsg_ros.view.live.camera import CameraView  # noqa: E402
 from deworldsg_ros.view.live.server import Viewer  # noqa: E402
+from deworldsg_ros.view.live.state import Guard  # noqa: E402
 
 LIMIT_S = 30.0
 HERE = "127.0.0.1"
@@ -101,7 +104,7 @@ def test_a_server_listens_on_the_chosen_port_or_the_next_free_one(
 ):
     pytest.importorskip(module, reason=f"needs {module}")
     with closing(sources.open_sink(HERE, taken, "", foxglove=foxglove)) as sink:
-        chosen = int(sink.url.rsplit(":", 1)[1])
+        chosen = urlsplit(sink.url).port
         assert taken < chosen < taken + sources.MOST_PORTS
         with socket.create_connection((HERE, chosen)):
             pass
@@ -114,6 +117,83 @@ def test_a_server_listens_on_the_chosen_port_or_the_next_free_one(
 def test_an_address_of_another_machine_is_refused(host):
     with pytest.raises(ConfigurationError, match=host):
         sources.open_sink(host, 0, "", foxglove=False)
+
+
+def answer(port, target, upgrade, **headers):
+    """First line of the answer of a server to a request, with the version that a page names."""
+    fields = {"Host": f"{HERE}:{port}", **headers}
+    if upgrade:
+        fields |= {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+        fields |= {"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ=="}
+        protocols = f"viser-v{viser.__version__}, foxglove.sdk.v1"
+        fields |= {"Sec-WebSocket-Protocol": protocols}
+    text = "".join(f"{name}: {value}\r\n" for name, value in fields.items())
+    with socket.create_connection((HERE, port), LIMIT_S) as client:
+        client.sendall(f"GET {target} HTTP/1.1\r\n{text}\r\n".encode())
+        return client.makefile("rb").readline().decode()
+
+
+@pytest.mark.parametrize(("foxglove", "module"), [(False, "viser"), (True, "foxglove")])
+def test_only_the_printed_address_opens_a_server_and_no_page_of_others(foxglove, module, caplog):
+    pytest.importorskip(module, reason=f"needs {module}")
+    with closing(sources.open_sink(HERE, free_port(), "", foxglove=foxglove)) as sink:
+        port, path = urlsplit(sink.url).port, urlsplit(sink.url).path
+        own, here = f"http://{HERE}:{port}", f"localhost:{port}"
+        for upgrade in (True,) if foxglove else (True, False):
+            good = "HTTP/1.1 101" if upgrade else "HTTP/1.1 200"
+            assert answer(port, path, upgrade).startswith(good)
+            assert answer(port, path, upgrade, Origin=own).startswith(good)
+            assert answer(port, path, upgrade, Host=here, Origin=f"http://{here}").startswith(good)
+            for target in ("/", path[:-1], path + "x", "/" + path, path.upper(), f"{own}{path}"):
+                assert answer(port, target, upgrade).startswith("HTTP/1.1 403"), target
+            for origin in (
+                "http://evil.example",
+                f"http://evil.example:{port}",
+                "null",
+                "http://[",
+            ):
+                assert answer(port, path, upgrade, Origin=origin).startswith("HTTP/1.1 403"), origin
+            for host in (f"evil.example:{port}", f"localhost.evil.example:{port}", "", "[", "a@b"):
+                assert answer(port, path, upgrade, Host=host).startswith("HTTP/1.1 403"), host
+        times = 1 if foxglove else 2
+        assert sink.guard.refused == {"token": 6 * times, "origin": 4 * times, "host": 5 * times}
+    warnings = [record for record in caplog.records if "refused" in record.getMessage()]
+    assert len(warnings) == 3  # one a reason
+    assert path.strip("/") not in caplog.text
+
+
+def test_no_page_is_shown_that_is_not_guarded(monkeypatch):
+    made = create_autospec(viser.ViserServer, instance=True)
+    monkeypatch.setattr(viser, "ViserServer", lambda *_, **__: made)
+    with pytest.raises(ConfigurationError, match="cannot be guarded"):
+        Viewer(HERE, 0, "")
+    made.stop.assert_called_once_with()
+
+
+@pytest.mark.parametrize(
+    ("host", "start"),
+    [
+        ("0.0.0.0", "http://localhost:80/"),
+        ("::1", "http://[::1]:80/"),
+        (HERE, f"http://{HERE}:80/"),
+    ],
+)
+def test_the_printed_address_leads_to_the_server_and_is_new_each_time(host, start):
+    first, second = (Guard(host, "http").url(80) for _ in range(2))
+    assert first.startswith(start) and first != second and len(first) >= len(start) + 22
+
+
+def test_a_gate_passes_both_ways_and_ends_what_is_no_request(monkeypatch):
+    pytest.importorskip("foxglove", reason="needs foxglove-sdk")
+    from deworldsg_ros.view.live import foxglove as module
+
+    monkeypatch.setattr(module, "HEAD_S", 0.2)
+    with closing(module.FoxgloveServer(HERE, 0)) as server:
+        for text in (b"", b"\r\n\r\n", b"GET /\r\n\r\n", b"x" * 2 * module.HEAD_BYTES):
+            client = socket.create_connection((HERE, urlsplit(server.url).port), LIMIT_S)
+            with client, contextlib.suppress(ConnectionError):
+                client.sendall(text)
+                assert not client.recv(100)
 
 
 def test_a_late_client_of_foxglove_gets_the_whole_graph_and_then_the_updates():
