@@ -193,6 +193,21 @@ def test_what_others_plant_replaces_nothing(tmp_path, where):
     assert set(names(folder)) == {*before, "b"} - ({ready.name} if where == "here" else set())
 
 
+def test_a_file_that_cannot_be_moved_away_keeps_the_files_of_the_run_before(tmp_path, monkeypatch):
+    write_run(tmp_path, 2)
+    real = Path.rename
+
+    def rename(path, target):
+        if path == tmp_path / "graph.json":  # of another user, in a sticky folder
+            raise PermissionError(1, "Operation not permitted")
+        return real(path, target)
+
+    monkeypatch.setattr(Path, "rename", rename)
+    with pytest.raises(PermissionError):
+        write_run(tmp_path, 4)
+    assert run_in(tmp_path) == {b"00002"} and names(tmp_path) == [*FILES]
+
+
 @pytest.mark.parametrize("planted", ["link", "hard link", "owner"])
 def test_a_planted_lock_is_refused_and_what_it_names_stays(tmp_path, planted):
     mine, lock = tmp_path / "mine", tmp_path / ".a.map.lock"

@@ -208,7 +208,12 @@ def together(folder: Path, names: Iterable[str]) -> Iterator[Path]:
         _sync(staged)
         ready = staged.rename(staged.with_suffix(READY))
         _sync(folder)
-        _place(ready)
+        try:
+            _place(ready)
+        except OSError:  # such as a file of another user
+            with suppress(OSError):
+                _recover(ready)
+            raise
 
 
 @contextmanager
