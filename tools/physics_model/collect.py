@@ -10,6 +10,7 @@ surfaces, classes and votes; tools/physics_model/train.py reads it.
 from __future__ import annotations
 
 import argparse
+from itertools import islice
 from pathlib import Path
 
 import msgspec
@@ -19,24 +20,27 @@ from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end
 from deworldsg_ros.evaluation.recorded_room import open_annotations
 from deworldsg_ros.map_file import write_map
 from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.recording import Recording, open_source
 
 
-def collect(root: Path, layout: str, scene: str, out: Path, choice: FrontEndChoice) -> None:
-    """Run one scene and write its map."""
-    annotations = open_annotations(root, layout)
+def collect(
+    annotations: Annotations, scene: str, out: Path, choice: FrontEndChoice, every: int = 1
+) -> Path:
+    """Run one scene, of which every n-th frame, and write its map; returns its path."""
     source = open_source(annotations.scan_folder(scene))
     config = Config()
     config = msgspec.structs.replace(
         config, perception=msgspec.structs.replace(config.perception, max_relations=1000)
     )
     pipeline = Pipeline(config, build_front_end(choice, annotations, scene, source, config))
-    for frame in Recording(source).frames():
+    for frame in islice(Recording(source).frames(), 0, None, every):
         pipeline.process(frame)
     assert pipeline.builder is not None
     out.mkdir(parents=True, exist_ok=True)
-    write_map(pipeline.builder, out / f"{scene}.npz")
-    print(scene, len(pipeline.builder.graph), "nodes", flush=True)
+    path = out / f"{scene}.npz"
+    write_map(pipeline.builder, path)
+    return path
 
 
 def main() -> None:
@@ -51,7 +55,7 @@ def main() -> None:
     annotations = open_annotations(arguments.root, arguments.layout)
     for scene in arguments.scenes or annotations.scans():
         choice = FrontEndChoice("boxes", seed=arguments.seed)
-        collect(arguments.root, arguments.layout, scene, arguments.out, choice)
+        print(collect(annotations, scene, arguments.out, choice), flush=True)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from deworldsg_ros.relations.geometry import (
     pairs_in_reach,
 )
 from deworldsg_ros.relations.pairs import floor_height
-from deworldsg_ros.relations.physics import relation_counts
+from deworldsg_ros.relations.physics import PairInputs, relation_counts
 from deworldsg_ros.relations.states import (
     DIRECTED,
     RELATIONS,
@@ -30,6 +30,7 @@ from deworldsg_ros.relations.states import (
 # A node is in the box of an object if its mean is; the box is this much larger on every side.
 BOX_MARGIN_M = 0.05
 
+Array = NDArray[np.float64]
 Truth = dict[tuple[int, int], str]
 
 
@@ -63,9 +64,8 @@ class Room:
     on_floor: NDArray[np.int64]
 
 
-def load_room(map_path: Path, truth_path: Path) -> Room:
-    """The pairs of a map (collect.py), with the ground truth of its room."""
-    content = json.loads(truth_path.read_text())
+def load_room(map_path: Path, content: dict[str, Any]) -> Room:
+    """The pairs of a map (collect.py), with the content of the gt.json of its room."""
     objects = [item for item in content["objects"] if item.get("detectable") and item.get("vg")]
     truth = {(s, o): name for s, o, _, name in content["relationships"]}
     graph = graph_files.load(map_path)
@@ -158,4 +158,43 @@ def _stands_on_floor(item: dict[str, Any]) -> bool:
     """Physics knows it; other rooms list nothing that carries it, and its bottom."""
     if "physics" in item:
         return bool(item["physics"]["on_floor"])
-    return item["parent"] is None and abs(item["aabb"][0][2]) < 0.01
+    return item.get("parent") is None and abs(item["aabb"][0][2]) < 0.01
+
+
+def rooms_of(folders: list[list[Path]]) -> list[Room]:
+    """All rooms of pairs of a folder of maps and the data set of these rooms."""
+    return [
+        load_room(path, json.loads((root / "data" / path.stem / "gt.json").read_text()))
+        for maps, root in folders
+        for path in sorted(maps.glob("*.npz"))
+    ]
+
+
+def inputs_of(rooms: list[Room], classes: list[Array] | None = None) -> tuple[Array, Array]:
+    """Inputs of the network for first and second, and for second and first.
+
+    Args:
+        rooms: their pairs.
+        classes: class distributions of the nodes of each room; None = those of the maps.
+    """
+    both: list[list[Array]] = [[], []]
+    for index, room in enumerate(rooms):
+        known = (room.class_probabilities if classes is None else classes[index], room.observations)
+        make = PairInputs(room.classes).make
+        for end, pairs in enumerate((room.pairs, room.pairs[:, ::-1])):
+            both[end].append(make(room.features[end], *known, pairs[:, 0], pairs[:, 1]))
+    return np.concatenate(both[0]), np.concatenate(both[1])
+
+
+def states_of(rooms: list[Room]) -> NDArray[np.int64]:
+    """True states of all pairs."""
+    return np.concatenate([room.states for room in rooms])
+
+
+def nodes_of(rooms: list[Room]) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64]]:
+    """Pairs as rows of the nodes of all rooms; rise, log height and floor of these nodes."""
+    starts = np.cumsum([0, *(len(room.bottoms_m) for room in rooms)])
+    pairs = np.concatenate([room.pairs + start for room, start in zip(rooms, starts)])
+    rise = np.abs(np.concatenate([room.bottoms_m for room in rooms]))
+    height = np.log(np.concatenate([room.heights_m for room in rooms]) + 0.01)
+    return pairs, rise, height, np.concatenate([room.on_floor for room in rooms])
