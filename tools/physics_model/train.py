@@ -39,8 +39,8 @@ from deworldsg_ros.relations.physics import INPUT_COUNT, MAX_INPUT, PhysicsModel
 from deworldsg_ros.relations.rules import CARRIED_FIRST, CARRIED_SECOND
 from deworldsg_ros.relations.states import DIRECTED, STATE_COUNT
 
-# The same rooms and the same seed give the same weights. Sums in another order, of other threads or
-# processors, differ by 1e-16 of them; with single precision, 60 epochs make 1 % of that.
+# The same rooms and the same seed give the same weights: sums in another order, of other threads or
+# processors, differ in the 16th digit, which 60 epochs do not bring into single precision.
 torch.set_num_threads(1)
 torch.set_default_dtype(torch.float64)
 
@@ -142,11 +142,12 @@ def train(rooms: list[Room], seed: int, jobs: int) -> tuple[PhysicsModel, Figure
 def train_model(rooms: list[Room], seed: int) -> PhysicsModel:
     """A model whose networks are trained on these rooms; the rest of it is neutral."""
     generator = np.random.default_rng(seed)
-    noisy = [[noisy_classes(room, generator) for room in rooms] for _ in range(VARIANTS)]
-    made = [inputs_of(rooms, classes) for classes in noisy]
-    stacked = np.concatenate([inputs for both in made for inputs in both])
+    stacked = np.concatenate(inputs_of(rooms))
     means, scales = stacked.mean(axis=0), stacked.std(axis=0) + 1e-3
-    variants = [[(inputs - means) / scales for inputs in both] for both in made]
+    noisy = [[noisy_classes(room, generator) for room in rooms] for _ in range(VARIANTS)]
+    variants = [
+        [(inputs - means) / scales for inputs in inputs_of(rooms, classes)] for classes in noisy
+    ]
     members = [_train_network(rooms, variants, seed + k) for k in range(MEMBERS)]
     layers = [np.stack(layer) for layer in zip(*(layers for layers, _ in members))]
     floor = np.mean([floor for _, floor in members], axis=0)
