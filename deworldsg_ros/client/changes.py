@@ -41,6 +41,11 @@ class Pairing:
         return float(np.linalg.norm(np.subtract(self.after.position_m, self.before.position_m)))
 
     @property
+    def is_relabelled(self) -> bool:
+        """Whether it has two names; to gain or lose one is no change."""
+        return _are_called_differently(self.before, self.after)
+
+    @property
     def has_moved(self) -> bool:
         """Whether the distance is more than the box of a resting object changes."""
         side = max(*self.before.size_m, *self.after.size_m)
@@ -194,12 +199,16 @@ def _place_reach_m(item: SceneObject) -> float:
     return max(SAME_PLACE_M, max(item.size_m) / 2)
 
 
+def _are_called_differently(a: SceneObject, b: SceneObject) -> bool:
+    return a.is_named and b.is_named and a.label != b.label
+
+
 def _place_cost(a: SceneObject, b: SceneObject) -> float:
     """Cost of taking two objects for one that did not move; infinite if they are too far apart."""
     distance = float(np.linalg.norm(np.subtract(a.position_m, b.position_m)))
     reach = max(_place_reach_m(a), _place_reach_m(b))
     # Different classes at one place are rarer than noise of the place.
-    if a.label != b.label:
+    if _are_called_differently(a, b):
         reach, distance = reach / 2, distance + reach / 2
         return distance if distance <= 2 * reach else np.inf
     return distance if distance <= reach else np.inf
@@ -207,13 +216,14 @@ def _place_cost(a: SceneObject, b: SceneObject) -> float:
 
 def _move_cost(a: SceneObject, b: SceneObject) -> float:
     distance = float(np.linalg.norm(np.subtract(a.position_m, b.position_m)))
-    return distance if a.label == b.label and distance <= REACH_M else np.inf
+    same = a.label == b.label and a.is_named
+    return distance if same and distance <= REACH_M else np.inf
 
 
 def _changes(added: list[SceneObject], gone: list[SceneObject], pairs: list[Pairing]) -> Changes:
     moved = [pair for pair in pairs if pair.has_moved]
-    relabelled = [pair for pair in pairs if pair.before.label != pair.after.label]
-    same = sum(not pair.has_moved and pair.before.label == pair.after.label for pair in pairs)
+    relabelled = [pair for pair in pairs if pair.is_relabelled]
+    same = sum(not pair.has_moved and not pair.is_relabelled for pair in pairs)
     return Changes(tuple(added), tuple(gone), tuple(moved), tuple(relabelled), same)
 
 

@@ -443,11 +443,12 @@ def _fused(a: SceneObject, b: SceneObject) -> wire.NodeState:
     seen_more = a if count >= more else b
     known = [item for item in (a.existence, b.existence) if item is not None]
     first, last = min(a.first_seen_ns, b.first_seen_ns), max(a.last_seen_ns, b.last_seen_ns)
-    named = a.is_named or b.is_named
+    # A name of one graph alone is the name.
+    named = [item.label for item in (a, b) if item.is_named]
     return msgspec.structs.replace(
         a.state,
-        label=best[0][0] if named else a.label,
-        named=named,
+        label=best[0][0] if len(named) == 2 else (*named, a.label)[0],
+        named=bool(named),
         classes=[wire.Belief(label, round(value, 4)) for label, value in best],
         remainder=round(max(0.0, 1.0 - sum(value for _, value in best)), 4),
         **_geometry(mean, covariance, points),

@@ -79,7 +79,8 @@ def explain_object(
         kind = "class" if item.is_named else "no class is probable enough for a name"
         lines.append(f"{kind}: {names}; all others {item.other_classes:.0%}")
     if not item.is_sure:
-        lines.append(f"not sure: it is a {item.label} with {item.probability:.0%} in all")
+        what = f"it is a {item.label}" if item.is_named else "there is an object"
+        lines.append(f"not sure: {what} with {item.probability:.0%} in all")
     looks = f"{len(item.surface_m)} surface points" if len(item.surface_m) else "no surface points"
     size = " x ".join(item.size_words)
     lines.append(f"box {size} cm, from the {item.box_source}; {looks} in this message")

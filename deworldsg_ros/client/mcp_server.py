@@ -263,7 +263,8 @@ def _about(graph: SceneGraph) -> dict[str, Any]:
 def _short(item: SceneObject) -> dict[str, Any]:
     names = ("id", "label", "probability", "sure", "position_m", "size_m", "colour", "observations")
     values = item.to_dict()
-    return {name: values[name] for name in names}
+    guesses = {} if item.is_named else {"named": False, "guesses": values["classes"]}
+    return {name: values[name] for name in names} | guesses
 
 
 def _which(text: Named) -> int | str | None:

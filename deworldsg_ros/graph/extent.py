@@ -27,8 +27,8 @@ EVEN_RADIUS_M = 0.015
 # median of that distance. Mixed pixels at depth edges lie apart from the surface. Chosen on the two
 # rendered rooms: 1.5 cuts corners off, 3 keeps mixed pixels.
 OUTLIER_FACTOR = 2.0
-# Nor if that neighbour is this near, where the images tell which points are the node's: a seat
-# behind a table is in few views, its points are far apart, and no outliers.
+# Where the images tell which points are the node's, a point so near its third neighbour is never an
+# outlier: the seat of a chair behind a table is in few views, and its points lie far apart.
 NEAR_ENOUGH_M = 0.06
 # So few points have no outliers.
 FEW_POINTS = 6
@@ -48,8 +48,8 @@ AROUND_M = 0.02
 # Ends of two boxes are the same within `END_M` if their axes are within this.
 SAME_COS = math.cos(math.radians(15.0))
 # A side may go on if at least MIN_CUT frames do not show its end, and at most MAX_SEEN of all do:
-# masks and depth are wrong in some. Or if as many frames say that what is beyond is the object's as
-# say that it is not.
+# masks and depth are wrong in some. It may also go on if as many frames show the object beyond it
+# as show something else there.
 MIN_CUT, MAX_SEEN = 2, 0.1
 # Weights of points with these many points around.
 _EVEN_WEIGHTS = np.append(0.0, np.arange(1.0, 4097.0) ** -0.5)

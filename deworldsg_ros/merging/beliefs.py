@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from itertools import chain
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -27,8 +30,8 @@ DRAWN = 0.5
 WRONG = 0.2
 OUTLIERS = 0.4
 # A detector that is wrong says the same wrong name from all sides. So no number of views makes a
-# name surer than the view that was surest of it; and all other labels together always keep the
-# probability OTHERS.
+# name surer than the view that was surest of it. All classes evenly share the rest, at least
+# OTHERS.
 OTHERS = 0.05
 
 # The part of a node's record that belongs to its name: the labels (-1 = none), the probability
@@ -43,8 +46,19 @@ NAME_FIELDS: list[Any] = [
 ]
 
 
-def start(record: Any, probabilities: Float64) -> None:
-    """Begin with class probabilities (C,)."""
+def most_certain(*records: Any) -> dict[int, float]:
+    """The probability of each label in the view of any of these nodes that was surest of it."""
+    rows = [zip(one["labels"].tolist(), one["most_certain"].tolist()) for one in records]
+    best: dict[int, float] = {}
+    for label, probability in chain(*rows):
+        best[label] = max(best.get(label, 0.0), probability)
+    return best
+
+
+def start(
+    record: Any, probabilities: Float64, certain: Mapping[int, float] = MappingProxyType({})
+) -> None:
+    """Begin with class probabilities (C,), and what views before were certain of, by label."""
     order = np.argsort(-probabilities, kind="stable")[:LABELS]
     count = len(order)
     drawn = np.full((count, count), WRONG / max(count - 1, 1))
@@ -52,7 +66,9 @@ def start(record: Any, probabilities: Float64) -> None:
     record["labels"], record["joint"], record["named_from"] = -1, 0.0, 0
     record["labels"][:count] = order
     record["most_certain"] = 0.0
-    record["most_certain"][:count] = probabilities[order]
+    record["most_certain"][:count] = [
+        max(float(probabilities[label]), certain.get(label, 0.0)) for label in order.tolist()
+    ]
     joint = drawn * probabilities[order]
     record["joint"][:count, :count] = joint / joint.sum()
 

@@ -257,8 +257,8 @@ MERGE_THRESHOLD = 9
 # A frame that shows both as two objects outweighs ten in which one object overlapped both. A
 # detector seldom makes two objects of one, but it often detects only one of two that touch.
 SEPARATE_WEIGHT = 30
-# Two objects that three viewpoints have shown together are two, whatever place they stand in: the
-# mask of a chair may take in the one beside it for many frames.
+# With evidence of about three viewpoints that show both, two objects are two, whatever place they
+# stand in: the mask of a chair may take in the one beside it for many frames.
 TWO_OBJECTS = 3 * SEPARATE_WEIGHT
 # A detection with a lower score is unsure. An object lies on a node if at least this fraction of
 # its cells does. With NanoDet (scores from 0.2; a rendered room and the shipped recording), 36 % of

@@ -315,8 +315,8 @@ class NodeRecords:
         """Combine the records of the nodes of two slots that the graph has merged."""
         record = self.rows[kept]
         beliefs.merge(record, self.rows[removed], graph.nodes.means[kept])
-        classes = graph.nodes.class_probabilities[kept]
-        beliefs.start(record, classes.copy())
+        certain = beliefs.most_certain(record, self.rows[removed])
+        beliefs.start(record, graph.nodes.class_probabilities[kept].copy(), certain)
         self.joint.merge(kept, removed)
         scores = self.map.scores(removed)
         cells = self.remove(removed)

@@ -75,8 +75,8 @@ def _turned_back_once(boxes_xyxy: Float64, height: int) -> Float64:
 # Suppression by IoU keeps a small box inside a large one of the same class.
 
 # Two objects have one class if the cosine of their class distributions exceeds this: how certain
-# the names are does not matter.
-SAME_CLASS = 0.5
+# the names are matters little.
+SAME_CLASS = 0.3
 # A box is nested if more than this fraction of it is inside another: edges are a few pixels off.
 NESTED_FRACTION = 0.8
 # A part has less than this fraction of the area of the whole. From there on the IoU is 0.5 or more,

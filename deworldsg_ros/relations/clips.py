@@ -394,7 +394,9 @@ class PublishedGraph:
         state = self._replica.nodes.get(node_id)
         if state is None or not state.confirmed:
             return None
-        return NodeView(state.label, state.observations)
+        # The best class, also of a node without a name.
+        label = state.classes[0].label if state.classes else state.label
+        return NodeView(label, state.observations)
 
     def visual_entropy_nats(self, a_id: int, b_id: int) -> float:
         """See `GraphView`. Every edge with visual evidence is published."""

@@ -65,7 +65,7 @@ class Stay:
 
     def is_left(self, node: wire.NodeState) -> bool:
         """Whether an object has moved or changed its label, as `deworldsg diff` decides."""
-        if node.label != self.label:
+        if node.named and node.label != self.label:
             return True
         center, size = box_of(node)
         least = max(MOVED_M, MOVED_PART * max(*size, *self.size_m))
@@ -436,6 +436,7 @@ def stay_of(row: Sequence[Any]) -> Stay:
 def _object_row(node: wire.NodeState, name: _Name) -> _Row:
     center, size = box_of(node)
     share = next((item.probability for item in node.classes if item.label == node.label), 0.0)
+    share = share if node.named else 1.0
     existence = node.existence if isinstance(node.existence, float) else 1.0
     first, last = wire.ns_from_stamp(node.first_seen), wire.ns_from_stamp(node.last_seen)
     return (

@@ -4,7 +4,7 @@
     python tools/calibration/calibrate_names.py CAPTURES
 
 CAPTURES is a folder of tools/merging_lab/capture.py with annotated scans, made by the detector that
-is calibrated, and by a version of it without `certainty`. Each published node is one example: the
+is calibrated, with its `certainty` set to None. Each published node is one example: the
 best score among the detections that have its name, the share of the name among all names that were
 seen, and whether it is the name of the object in most of its detections. The probability that it is
 right is the share times the certainty. Prints slope and offset of the log odds of the certainty,
@@ -27,7 +27,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tools" / "merging_lab")]
 from captures import read_capture  # noqa: E402
 from replay import chosen_paths, read_truth, replay, translate  # noqa: E402
 
-from deworldsg_ros.config import Config  # noqa: E402
+from deworldsg_ros.config import Config, OutputConfig  # noqa: E402
 from deworldsg_ros.evaluation.edge_measures import Calibrated, calibration_error  # noqa: E402
 from deworldsg_ros.perception.backends.embedded import logit  # noqa: E402
 
@@ -39,7 +39,7 @@ def examples(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         raise SystemExit(f"{path}: expected a capture of an annotated scan")
     truth = read_truth(capture.root, capture.layout, capture.scan)
     of_object = dict(zip(truth.reference.ids, truth.reference.labels))
-    replayed = replay(capture, Config())
+    replayed = replay(capture, Config(output=OutputConfig(min_name=0.0)))
     votes: dict[int, Counter[int]] = defaultdict(Counter)
     best: dict[tuple[int, str], float] = defaultdict(float)
     for local, objects, nodes in zip(capture.local_graphs, capture.object_ids, replayed.node_ids):
