@@ -341,10 +341,9 @@ def _loss_tasks(
     data: LossOptions, detections: DetectionOptions, running: RunOptions, out: Path
 ) -> list[ScanTask]:
     scoring = ScoringOptions()
-    known = DataOptions(data.dataset, data.layout, data.split, data.scans)
     if data.boxes is None:
         annotations = open_annotations(data.dataset, data.layout)
-        return scan_tasks(annotations, known, detections, running, scoring, out)
+        return scan_tasks(annotations, data, detections, running, scoring, out)
     if detections.front_end != "backend":
         raise EvaluationError(
             f"--boxes with --front-end {detections.front_end}: a recording without a data set has "
@@ -354,8 +353,8 @@ def _loss_tasks(
         raise EvaluationError(
             f"--boxes with --scan {data.scans[0]}: the file has the objects of one recording"
         )
-    known = replace(known, scans=[data.dataset.resolve().stem])
-    return scan_tasks(None, known, detections, running, scoring, out)
+    named = replace(data, scans=[data.dataset.resolve().stem])
+    return scan_tasks(None, named, detections, running, scoring, out)
 
 
 def _print_losses(scan: str, losses: Sequence[Loss], console: Console) -> None:

@@ -32,7 +32,7 @@ class DataOptions:
 
 
 @dataclass(frozen=True)
-class LossOptions:
+class LossOptions(DataOptions):
     """Annotated data, or a recording and boxes."""
 
     dataset: Annotated[
@@ -49,11 +49,6 @@ class LossOptions:
     boxes: Annotated[
         Optional[Path],
         typer.Option("--boxes", metavar="FILE", help="JSON file of objects: names and boxes"),
-    ] = None
-    split: Annotated[str, typer.Option("--split", help="train, validation or test")] = "test"
-    scans: Annotated[
-        Optional[list[str]],
-        typer.Option("--scan", help="this scan only, not the split; may be repeated"),
     ] = None
 
 
