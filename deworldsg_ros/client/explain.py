@@ -28,10 +28,11 @@ from deworldsg_ros.scene.vocabulary import CARRY_ON_TOP, PREDICATES, plain
 
 # Two boxes are in contact below this gap: the error of a measured extent.
 CONTACT_M = 0.04
-# Of a place: so many objects are named; a class with less is no guess; seen space lies so far
-# around it, and with less of it seen it was never in view.
+# Objects near a place that an answer lists at most.
 MOST_NEAR = 5
+# A class with a lower probability is not named as a guess.
 LEAST_GUESS = 0.1
+# A place was never in view if less than LEAST_SEEN of the space within AROUND_M of it was seen.
 AROUND_M, LEAST_SEEN = 0.3, 0.1
 ANYTHING = "anything"
 

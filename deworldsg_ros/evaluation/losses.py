@@ -66,10 +66,11 @@ def _annotated(task: ScanTask, source: Source) -> tuple[Truth, Perceiver]:
 # The detector is asked once more for each frame, for all boxes from this score on. Below, a network
 # has a box for everything.
 LOW_SCORE = 0.05
-# In a clear view an object has so many pixels, sides as long, and so much of its box in the image;
-# the figures of the rendered rooms for what a detector can find. An object that fewer frames show
-# clearly, and that no detection shows, was never seen.
+# A view of an object is clear if it shows at least MIN_PIXELS of it, both sides of its box in the
+# image are MIN_SIDE_PX long, and MIN_PART of the box is inside the image. The rendered rooms have
+# these limits for what a detector can find.
 MIN_PIXELS, MIN_SIDE_PX, MIN_PART = 200.0, 10.0, 0.3
+# With fewer clear views, and without a detection, an object was never seen.
 MIN_VIEWS = 3
 # A detection is of the object whose visible pixels it fits best, from this overlap on, and rather
 # of one that it names right.

@@ -50,8 +50,8 @@ KINDS: tuple[frozenset[str], ...] = (
 # carry below their highest point. So may what is not known here.
 CARRY_ON_TOP = TABLES | FLAT | {"oven", "refridgerator", "refrigerator", "microwave", "toaster"}
 
-# Classes of which two never stand in one place, one over the other. Tables do: boxes of a table
-# often show what is under it.
+# Two objects of such a class never stand one over the other. Tables are not among them: the box of
+# a table often shows what is under it.
 ALONE_IN_PLACE = SEATS | BEDS | PLANTS | {"refridgerator", "refrigerator"}
 
 # Classes of the objects that a class is fixed to.

@@ -298,7 +298,9 @@ def up_of(replica: GraphReplica) -> Point:
 
 
 class Guard:
-    """Lets in whoever has the address that a server prints; web pages of others stay outside.
+    """Checks each request to a server: only the address that the server prints opens it.
+
+    So a page of another site, in a browser on this machine, cannot read the server.
 
     Args:
         host: address that the server listens on.
