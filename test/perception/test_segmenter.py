@@ -76,6 +76,26 @@ def test_what_is_seen_through_an_object_is_not_its_own():
     assert beyond.sum() < 0.1 * (owner > 0).sum()
 
 
+RUG = Slab((-0.5, 0.9, 0.0), (0.5, 1.7, 0.004), (60, 40, 30))
+FOOT = Slab((-0.1, 1.2, 0.0), (0.1, 1.4, 0.4), (110, 70, 40))
+BOARD = Slab((-0.6, 1.1, 0.4), (0.6, 1.7, 0.44), (110, 70, 40))
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.004])
+def test_an_object_that_rises_from_the_floor_contains_no_part_of_it(monkeypatch, noise_m):
+    monkeypatch.setattr(rgbd, "KEPT_BELIEF", 0.0)  # all regions in the box are believed
+    rgb, depth_m, owner = render([RUG, FOOT, BOARD], noise_m)
+    table = owner >= 2
+    (mask,) = segment(rgb, depth_m, box_of(table))
+    assert overlap(mask, table) > 0.88
+
+
+def test_a_rug_in_its_own_box_stays():
+    rgb, depth_m, owner = render([RUG], 0.002)
+    (mask,) = segment(rgb, depth_m, box_of(owner == 1))
+    assert overlap(mask, owner == 1) > 0.8
+
+
 @pytest.mark.parametrize("fraction", [0.1, 0.3])
 def test_holes_in_the_depth_are_filled(fraction):
     rgb, depth_m, owner = render([CHEST], 0.002)

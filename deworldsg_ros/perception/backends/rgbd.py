@@ -73,6 +73,16 @@ MAX_DEPTH_DIFFERENCE = 0.5
 MIN_BELIEF = 2e-3
 # Regions with at least this belief are the object.
 KEPT_BELIEF = 0.45
+# The floor is the largest plane with next to nothing below it that is level in an upright image:
+# least height of its unit normal, least fraction of the image, what counts as below, and the most
+# of that, as a fraction of the floor.
+FLOOR_MIN_UP, FLOOR_MIN_AREA = 0.5, 0.02
+BELOW_FLOOR_M, FLOOR_MAX_BELOW = 0.1, 0.1
+# Regions of the floor have normals so near to its own, and are so near to it, in standard
+# deviations: more while it is looked for, less in the end: the base of a lamp is 2 cm high.
+FLOOR_MIN_COSINE, FLOOR_SEARCH_OFFSET, FLOOR_OFFSET = 0.95, 3.0, 0.6
+# An object of which at least this fraction is so far above the floor contains no part of it.
+ABOVE_FLOOR_M, ABOVE_FRACTION = 0.1, 0.15
 # Columns of the evidence. Those up to "rank" are fixed, the others depend on the beliefs.
 EVIDENCE = (
     "distance",  # from the background
@@ -170,7 +180,43 @@ def cut_boxes(regions: Regions, boxes_cells: Int64) -> Int32:
     regions = regions._replace(strength=regions.strength**STRENGTH_POWER)
     for row in np.argsort(sides.prod(axis=1), kind="stable"):
         _cut_box(regions, boxes_cells[row], owner, row)
+    _leave_out_floor(regions, owner, len(boxes_cells))
     return owner
+
+
+def _leave_out_floor(regions: Regions, owner: Int32, count: int) -> None:
+    """Take the floor from the `count` objects that rise from it.
+
+    A rug below a table lies wholly in the box of the table, and is like nothing around it.
+    """
+    seen, point = regions.valid >= POINT_MIN_CELLS, regions.point
+    noise_m = PLANE_NOISE_M + PLANE_NOISE_PER_M2 * point[:, 2] ** 2
+    is_level = (regions.valid >= PLANE_MIN_CELLS) & (regions.flatness >= PLANE_MIN_FLATNESS)
+    is_level &= regions.normal[:, 1] < -FLOOR_MIN_UP
+    planes, origins = regions.normal[is_level], point[is_level]
+    heights_m = planes @ point.T - (planes * origins).sum(axis=1)[:, None]
+    are_on = seen & (np.abs(heights_m) <= FLOOR_SEARCH_OFFSET * noise_m)
+    are_on &= planes @ regions.normal.T >= FLOOR_MIN_COSINE
+    areas = are_on @ regions.area
+    below = (seen & (heights_m < -BELOW_FLOOR_M)) @ regions.area
+    is_floor = (areas >= FLOOR_MIN_AREA * regions.area.sum()) & (below <= FLOOR_MAX_BELOW * areas)
+    if not is_floor.any():
+        return
+    # The plane through all of its regions: the normal of one is too rough.
+    on = are_on[np.argmax(is_floor * areas)]
+    weights = regions.area[on] / regions.area[on].sum()
+    center = weights @ point[on]
+    apart = point[on] - center
+    up = np.linalg.eigh((apart * weights[:, None]).T @ apart)[1][:, 0]
+    up *= -np.sign(up[1])
+    height_m = (point - center) @ up
+    on = (np.abs(height_m) <= FLOOR_OFFSET * noise_m) & (regions.normal @ up >= FLOOR_MIN_COSINE)
+    # The fraction of each object above.
+    owned = seen & (owner >= 0)
+    total = np.bincount(owner[owned], regions.area[owned], count)
+    high = owned & (height_m > ABOVE_FLOOR_M)
+    rises = np.bincount(owner[high], regions.area[high], count) >= ABOVE_FRACTION * total
+    owner[owned & on & rises[owner]] = -1
 
 
 def _cut_box(regions: Regions, box: Int64, owner: Int32, row: int) -> None:
