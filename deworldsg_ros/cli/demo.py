@@ -31,12 +31,13 @@ from deworldsg_ros.base.words import counted
 from deworldsg_ros.checkpoints.catalogue import require_checkpoints, unused_detector
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
-from deworldsg_ros.cli.outputs import as_report, print_findings, sizes_of
+from deworldsg_ros.cli.outputs import as_report, print_findings, print_part, sizes_of
 from deworldsg_ros.cli.terminal import (
     dds_environment,
     find_shared,
     frame_progress,
     node_command,
+    stopping_early,
     working,
 )
 from deworldsg_ros.config import Config
@@ -288,6 +289,9 @@ class ReplayProgress:
         nodes: the other processes.
         frames: number of RGB images in the recording.
         console: terminal.
+
+    Attributes:
+        stopped: whether Ctrl-C ended the replay before the last frame.
     """
 
     def __init__(
@@ -302,9 +306,12 @@ class ReplayProgress:
         self._task = self._progress.add_task("replaying", total=frames, start=False, note="")
         self._saved: replaying.Saved | None = None
         self._finished: replaying.Finished | None = None
+        self.stopped = False
 
     def follow(self, on_started: Callable[[], None] | None = None) -> replaying.Finished:
         """Show events until the replay has finished.
+
+        After the first frame, the first Ctrl-C ends the replay early, and the graph is saved.
 
         Args:
             on_started: called when the nodes are ready and the first frame is published.
@@ -314,19 +321,27 @@ class ReplayProgress:
         """
         threading.Thread(target=self._read, name="replay events", daemon=True).start()
         self._status.start()
+        stack = contextlib.ExitStack()
         try:
             while self._finished is None:
                 event = self._next()
                 self._show(event)
-                if on_started is not None and isinstance(event, replaying.Started):
-                    on_started()
+                if isinstance(event, replaying.Started):
+                    stack.enter_context(stopping_early(self._stop))
+                    if on_started is not None:
+                        on_started()
         finally:
+            stack.close()
             self._status.stop()
             self._progress.stop()
         if self._saved is None or not self._saved.success:
             problem = self._saved.message if self._saved else "replay_node did not request it"
             raise DemoFailed(f"graph_node saved no graph: {problem}{_hint(self._finished)}")
         return self._finished
+
+    def _stop(self) -> None:
+        self.stopped = True
+        self._replay.signal(replaying.STOP_EARLY)
 
     def _read(self) -> None:
         for line in self._replay.output:
@@ -358,7 +373,7 @@ class ReplayProgress:
             self._progress.start_task(self._task)
             self._progress.start()
         elif isinstance(event, replaying.Progress):
-            finishing = event.published >= self._frames
+            finishing = self.stopped or event.published >= self._frames
             note = "finishing …" if finishing else counted(event.nodes, "node")
             self._progress.update(self._task, completed=event.published, note=note)
         elif isinstance(event, replaying.Saved):
@@ -467,6 +482,8 @@ def run_demo(
 
     Raises:
         DeWorldSGError: for unusable input, or if a process ends early.
+        KeyboardInterrupt: after Ctrl-C. If it came during the replay, the results are those of the
+            frames so far; a second one leaves none.
     """
     config = effective_config(config_path, settings)
     require_checkpoints(config.perception, config.relations)
@@ -488,8 +505,12 @@ def run_demo(
             outputs.show_graph(staged, graph, console, poses, config.inputs.world_up, frames)
             findings = _findings(graph, finished, config)
             _write_report(staged, recording, graph, finished, wall_s, findings)
+        if progress.stopped:
+            print_part(console, finished.published, recording.frames)
         _print_summary(out, finished, console)
         print_findings(console, findings)
+        if progress.stopped:
+            raise KeyboardInterrupt
         view.stay_open()
 
 

@@ -179,6 +179,11 @@ def print_noted(console: Console, note: str, text: str) -> None:
     console.print(line, highlight=False, soft_wrap=True)
 
 
+def print_part(console: Console, frames: int, images: int) -> None:
+    """Say that the results are those of a part of a recording."""
+    print_noted(console, "stopped:", f"the results are those of {frames} of {images} frames")
+
+
 # --- Observations of a run for the doctor, and the output of its findings.
 
 

@@ -37,8 +37,9 @@ from deworldsg_ros.cli.outputs import (
     print_drops,
     print_findings,
     print_noted,
+    print_part,
 )
-from deworldsg_ros.cli.terminal import frame_progress, say_instead, working
+from deworldsg_ros.cli.terminal import frame_progress, say_instead, stopping_early, working
 from deworldsg_ros.config import Config
 from deworldsg_ros.doctor import Finding, find
 from deworldsg_ros.evaluation.temporal import UpdateLog
@@ -115,6 +116,7 @@ class _Processed:
         album: some of the frames.
         observer: what the doctor has to know.
         wall_s: seconds for all frames.
+        stopped: whether Ctrl-C ended it before the last frame.
     """
 
     poses: dict[int, Float64]
@@ -123,6 +125,7 @@ class _Processed:
     album: Album
     observer: RunObserver
     wall_s: float
+    stopped: bool
 
     @property
     def frames_per_s(self) -> float:
@@ -142,15 +145,24 @@ class _Ran:
 
 
 def run_recording(options: RunOptions, console: Console) -> None:
-    """Run, write the results and print a summary; raises DeWorldSGError."""
+    """Run, write the results and print a summary.
+
+    After Ctrl-C, the results are those of the frames so far.
+
+    Raises:
+        DeWorldSGError: for unusable input.
+        KeyboardInterrupt: after Ctrl-C; a second one, before the results are written.
+    """
     _check_paths(options)
     # The map is ours from reading to writing: what another process adds to it would be lost.
     with claim_map(options.map_path) if options.map_path else nullcontext():
         ran = _run(options, console, lambda: outputs.check_folder(options.out))
         _write_results(options, ran, console)
     outputs.print_drops(console, ran.recording.losses, ran.drops, ran.recording.reasons)
-    _print_summary(options, ran.pipeline, ran.processed, console)
+    _print_summary(options, ran.recording.frame_count, ran.pipeline, ran.processed, console)
     print_findings(console, ran.findings)
+    if ran.processed.stopped:
+        raise KeyboardInterrupt
 
 
 def _check_paths(options: RunOptions) -> None:
@@ -198,6 +210,8 @@ def _run(options: RunOptions, console: Console, prepare: Callable[[], None] = la
     finally:
         source.close()
     drops = {"recording": dict(recording.drops), "pipeline": dict(processed.refused)}
+    if not processed.poses and processed.stopped:
+        raise KeyboardInterrupt
     if not processed.poses:
         outputs.print_drops(console, recording.losses, drops, recording.reasons)
         print_findings(console, processed.observer.findings(recording, pipeline, drops))
@@ -243,6 +257,7 @@ def _process(
     observer = RunObserver()
     updates = UpdateLog(pipeline.config.output.rate_hz) if options.temporal else None
 
+    stop = threading.Event()
     lock = threading.Lock()
 
     def refuse(refusal: RefusedInput) -> None:
@@ -251,7 +266,7 @@ def _process(
             recording.reasons.setdefault(refusal.reason, str(refusal))
 
     total = min(recording.frame_count, options.max_frames or recording.frame_count)
-    with frame_progress(console) as progress, ExitStack() as stack:
+    with frame_progress(console) as progress, stopping_early(stop.set), ExitStack() as stack:
         task = progress.add_task("building the graph", total=total, note="")
         frames = posed_frames(recording, options.poses, refuse)
         chosen = itertools.islice(frames, options.max_frames or None)
@@ -267,9 +282,11 @@ def _process(
             # Counting the nodes takes time: not in every frame.
             if len(poses) % 5 == 0:
                 progress.update(task, note=_node_count(pipeline))
+            if stop.is_set():
+                break
         progress.update(task, note=_node_count(pipeline), total=len(poses) + refused.total())
     wall_s = time.perf_counter() - started_s
-    return _Processed(poses, refused, updates, album, observer, wall_s)
+    return _Processed(poses, refused, updates, album, observer, wall_s, stop.is_set())
 
 
 def _note_update(
@@ -319,6 +336,7 @@ def _report(ran: _Ran, graph: wire.SceneGraphMessage) -> dict[str, Any]:
         "kind": recording.source.kind,
         "poses": recording.source.topics[Role.POSE].name,
         "frames": {"images": recording.frame_count, "processed": len(processed.poses)},
+        "stopped": processed.stopped,
         "drops": {**ran.drops, "objects": dict(pipeline.drops)},
         "losses": recording.losses,
         "findings": as_report(ran.findings),
@@ -338,9 +356,11 @@ def _report(ran: _Ran, graph: wire.SceneGraphMessage) -> dict[str, Any]:
 
 
 def _print_summary(
-    options: RunOptions, pipeline: Pipeline, processed: _Processed, console: Console
+    options: RunOptions, images: int, pipeline: Pipeline, processed: _Processed, console: Console
 ) -> None:
     frames = len(processed.poses)
+    if processed.stopped:
+        print_part(console, frames, images)
     console.print(
         f"{counted(frames, 'frame')} in {processed.wall_s:.1f} s "
         f"({processed.frames_per_s:.1f} per second)",

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import sys
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -75,6 +79,31 @@ def node_command(name: str) -> list[str]:
             if os.access(executable, os.X_OK):
                 return [str(executable)]
     return [sys.executable, "-m", f"{PACKAGE}.nodes.{name}"]
+
+
+# --- Ctrl-C that keeps what there is.
+
+
+@contextlib.contextmanager
+def stopping_early(stop: Callable[[], None]) -> Iterator[None]:
+    """The first Ctrl-C calls `stop`; the next one interrupts, as before.
+
+    Only the main thread has signals: in another one, nothing changes.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = signal.getsignal(signal.SIGINT)
+
+    def interrupted(*_: Any) -> None:
+        signal.signal(signal.SIGINT, former)
+        stop()
+
+    signal.signal(signal.SIGINT, interrupted)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, former)
 
 
 # --- The progress bar and the spinner of all commands.

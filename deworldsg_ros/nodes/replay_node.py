@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import sys
 import threading
 import time
@@ -417,6 +418,7 @@ class ReplayNode(Node):
 
     Args:
         stop: set by a signal.
+        stop_early: set by `replaying.STOP_EARLY`.
         options: arguments of rclpy's Node.
 
     Raises:
@@ -424,9 +426,10 @@ class ReplayNode(Node):
         RecordingError: for a recording that cannot be read.
     """
 
-    def __init__(self, stop: threading.Event, **options: Any) -> None:
+    def __init__(self, stop: threading.Event, stop_early: threading.Event, **options: Any) -> None:
         super().__init__("replay_node", **options)
         self._stop = stop
+        self._stop_early = stop_early
         parameters = declare(self, ReplayParameters)
         self._options = parameters.node
         self._executor = SingleThreadedExecutor()
@@ -459,6 +462,8 @@ class ReplayNode(Node):
         for message in self._source.raw_messages():
             if message.role in self._outputs:
                 self._wait_until_due(message, alone)
+                if self._stop_early.is_set():
+                    break
                 self._publish(message)
                 self._emit_progress()
         self._monitor.window.close()
@@ -538,7 +543,7 @@ class ReplayNode(Node):
     def _wait_until_due(self, message: RawRoleMessage, alone: bool) -> None:
         now_s = time.monotonic()
         due_s = self._pace.due_s(message.log_time_ns, now_s)
-        while now_s < due_s:
+        while now_s < due_s and not self._stop_early.is_set():
             self._spin(due_s - now_s)
             now_s = time.monotonic()
         self._spin(0.0)
@@ -546,6 +551,7 @@ class ReplayNode(Node):
         while (
             message.role is Role.RGB
             and not alone
+            and not self._stop_early.is_set()
             and self._monitor.has_to_wait(STALL_S, time.monotonic())
         ):
             self._spin(SPIN_PERIOD_S)
@@ -619,9 +625,11 @@ def _open_recording(parameters: ReplayParameters) -> Source:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; 0 at the end or after a signal, 2 for unusable input, 3 without the nodes."""
+    stop_early = threading.Event()
+    signal.signal(replaying.STOP_EARLY, lambda *_: stop_early.set())
 
     def body(stop: threading.Event) -> int:
-        node = ReplayNode(stop)
+        node = ReplayNode(stop, stop_early)
         try:
             node.replay()
         except NotReady as error:

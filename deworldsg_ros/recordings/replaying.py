@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections import deque
 from collections.abc import Collection
 from typing import Union
@@ -9,6 +10,9 @@ from typing import Union
 import msgspec
 
 from deworldsg_ros.recordings.source import Role
+
+# Asks a replay to publish no more, and to go on as after the last message.
+STOP_EARLY = signal.SIGUSR1
 
 # --- Events that a replay reports to the program that started it: one JSON line each, on stdout.
 

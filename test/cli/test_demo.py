@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import time
@@ -117,6 +118,21 @@ def test_an_interrupt_leaves_no_node_behind(recording, tmp_path, number):
     for pid in nodes:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
+
+
+def test_ctrl_c_during_the_replay_leaves_the_graph_so_far(tmp_path):
+    process = start(tmp_path, "demo", DEMO_ROOM, "--out", "out")
+    for line in process.stdout:
+        if "live view: http" in line:
+            break
+    time.sleep(2.0)
+    process.send_signal(signal.SIGINT)
+    out, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, out + errors
+    assert "Traceback" not in errors
+    published = int(re.search(r"those of (\d+) of 171 frames", out)[1])
+    assert 0 < published < 171
+    assert read_graph(tmp_path / "out").nodes and (tmp_path / "out" / "scene_graph.html").exists()
 
 
 def test_a_process_that_starts_during_an_interrupt_is_listed(monkeypatch):

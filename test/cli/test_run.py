@@ -1,18 +1,23 @@
 """`deworldsg run` and scripts/tour on the recording that ships."""
 
+import itertools
 import json
 import os
+import signal
 import subprocess
 import sys
 
 import pytest
-from support.cli import COMMAND, DEMO_ROOM, ROOT, deworldsg, environment, printed
+from support.cli import COMMAND, DEMO_ROOM, ROOT, deworldsg, environment, invoke, printed
 from support.recordings import camera_items, write_bag
 
 from deworldsg_ros import pipeline
+from deworldsg_ros.cli import outputs
 from deworldsg_ros.config import load_config
 from deworldsg_ros.graph.extent import surface_points
+from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.relations.world_model import FakeWorldModel
+from deworldsg_ros.view.photos import Album
 from deworldsg_ros.wire import messages as wire
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
@@ -116,3 +121,33 @@ def test_the_tour_is_all_that_a_user_does_with_a_graph(tmp_path):
     ):  # fmt: skip
         assert words in done.stdout
     assert "MCP find" in done.stdout or "mcp is not installed" in done.stdout
+
+
+def press_ctrl_c_at(monkeypatch, *frames):
+    """Press it when these frames have been processed."""
+    count = itertools.count(1)
+
+    def add(album, frame):
+        if next(count) in frames:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Album, "add", add)
+
+
+def test_ctrl_c_leaves_the_results_of_the_frames_so_far(tmp_path, monkeypatch):
+    press_ctrl_c_at(monkeypatch, 6)
+    result = invoke("run", DEMO_ROOM, "--out", tmp_path, "--map", tmp_path / "room.map")
+    assert result.exit_code == 130
+    assert "the results are those of 6 of 171 frames" in result.stdout
+    assert json.loads((tmp_path / "run.json").read_text())["stopped"] is True
+    assert read_graph(tmp_path).nodes and (tmp_path / "scene_graph.html").exists()
+    assert (tmp_path / "room.map").exists()
+
+
+def test_a_second_ctrl_c_ends_at_once_and_keeps_the_results_of_before(tmp_path, monkeypatch):
+    assert invoke("run", DEMO_ROOM, "--out", tmp_path, "--max-frames", 8).exit_code == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    press_ctrl_c_at(monkeypatch, 3)
+    monkeypatch.setattr(outputs, "show_graph", lambda *_: signal.raise_signal(signal.SIGINT))
+    assert invoke("run", DEMO_ROOM, "--out", tmp_path).exit_code == 130
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
