@@ -57,8 +57,8 @@ ANYTHING = frozenset(
         "?",
     }
 )
-# A person asks no longer question, and each takes time of the graph's thread.
-MAX_QUESTION = 500
+# A person asks no longer question, and with no more conditions.
+MAX_QUESTION, MAX_CONDITIONS = 500, 8
 # What is compared, and whether most of it comes first.
 RANKS = {
     **dict.fromkeys(("largest", "biggest"), ("size", True)),
@@ -214,6 +214,12 @@ class _Reader:
                 ranks.append(self._rank(self.tokens.pop(0)))
             else:
                 conditions.append(self.condition())
+        conditions = list(dict.fromkeys(conditions))  # said twice, it counts once
+        if len(conditions) > MAX_CONDITIONS:
+            raise ClientError(
+                f"question '{self.question}': {len(conditions)} conditions: expected at most "
+                f"{MAX_CONDITIONS}"
+            )
         if thing is None and not conditions and not ranks:
             raise ClientError(f"question '{self.question}': expected a class, as in 'cup on table'")
         if len(ranks) > 1:

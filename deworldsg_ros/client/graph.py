@@ -219,8 +219,8 @@ NO_LOOKS = (
     "no object of the graph has an embedding: set perception.embedder, or use a detector that "
     "gives them; live, use SceneGraphClient(embeddings=True)"
 )
-# Characters of a name in an error.
-MOST_SHOWN = 60
+# Characters of a name in an error, and of a name at all: words are compared with many others.
+MOST_SHOWN, MAX_NAME = 60, 500
 
 
 @dataclass(frozen=True)
@@ -337,6 +337,11 @@ class SceneGraph:
         Raises:
             ClientError: if nothing is called so; it names what is spelt alike.
         """
+        if len(name) > MAX_NAME:
+            raise ClientError(
+                f"'{visible(name[:MOST_SHOWN])}…' has {len(name)} characters: expected the name of "
+                f"a class, at most {MAX_NAME}"
+            )
         found = self._understand(name)
         if found is not None:
             return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -25,6 +26,26 @@ from deworldsg_ros.scene.errors import ClientError
 MIN_PROBABILITY = 0.05
 # The opposite of "on".
 UNDER = frozenset({"under", "below"})
+# The most that one question may cost: objects that are compared, and seconds. A question that a
+# person asks of ten thousand objects compares a tenth of it.
+MOST_COMPARED, LIMIT_S = 1_000_000, 2.0
+
+
+class _Budget:
+    """The work and the time that are left for a question."""
+
+    def __init__(self, question: str) -> None:
+        self._question = question
+        self._left, self._end_s = MOST_COMPARED, time.monotonic() + LIMIT_S
+
+    def spend(self, compared: int) -> None:
+        """Note that so many objects are compared next; raises ClientError if it is too much."""
+        self._left -= compared
+        if self._left < 0 or time.monotonic() > self._end_s:
+            raise ClientError(
+                f"question '{self._question}' takes too long: expected fewer conditions, or "
+                "a class in place of 'anything'"
+            )
 
 
 @dataclass(frozen=True)
@@ -157,7 +178,10 @@ def ask(graph: SceneGraph, question: str) -> Answers:
         items = items[:1]
     if not any(item.colour for item in graph) and _asks_for_colour(pattern):
         notes.append("no object of the graph has a colour: it was made by an older release")
-    answers = [answer for item in items if (answer := _answer(graph, pattern, item)) is not None]
+    budget = _Budget(question)
+    answers = [
+        answer for item in items if (answer := _answer(graph, pattern, item, budget)) is not None
+    ]
     answers.sort(key=lambda answer: (-answer.probability, answer.item.id))
     if pattern.rank is not None:
         answers, more = _ranked(graph, pattern.rank, answers)
@@ -318,7 +342,9 @@ def _look_like(graph: SceneGraph, question: str, asked: Like) -> Answers:
     return Answers(question, tuple(answers), notes)
 
 
-def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | None:
+def _answer(
+    graph: SceneGraph, pattern: Pattern, item: SceneObject, budget: _Budget
+) -> Answer | None:
     chance = item.probability if pattern.thing is None else item.probability_of(pattern.thing)
     if chance < MIN_PROBABILITY:
         return None
@@ -330,7 +356,7 @@ def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | 
     for condition in pattern.conditions:
         if condition.own_colour is not None and item.colour is None:
             return None
-        part = _best_part(graph, item, condition, is_certain)
+        part = _best_part(graph, item, condition, is_certain, budget)
         if condition.is_negated:
             held = 0.0 if part is None else part[0]
             part = 1.0 - held, None, f"not {_words(condition)} ({1.0 - held:.0%})"
@@ -356,7 +382,11 @@ def _words(condition: Condition) -> str:
 
 
 def _best_part(
-    graph: SceneGraph, item: SceneObject, condition: Condition, is_certain: bool
+    graph: SceneGraph,
+    item: SceneObject,
+    condition: Condition,
+    is_certain: bool,
+    budget: _Budget,
 ) -> _Part | None:
     """The most probable way to fulfil a condition; the other object may count as certain."""
     if condition.own_colour is not None:
@@ -365,48 +395,29 @@ def _best_part(
     if condition.point is not None:
         is_close = distance_m(item, condition.point) <= (condition.within_m or 0.0)
         return (1.0, None, f"within {condition.within_m:g} m") if is_close else None
+    budget.spend(1)
+    best: dict[int, Relation] = {}
     if condition.predicate is None:
         around = graph.objects(near=item, within=condition.within_m or 0.0)
     else:
-        around = [found.object for found in graph.relations(item, condition.predicate)]
+        for relation in graph.relations(item, condition.predicate):
+            best.setdefault(relation.object.id, relation)
         if condition.predicate in UNDER:  # the table is under the cup that is on it
-            around += [found.subject for found in graph.relations(None, "on", item)]
-    around = [other for other in dict.fromkeys(around) if other.id != item.id]
+            for relation in graph.relations(None, "on", item):
+                best.setdefault(relation.subject.id, relation)
+        around = [graph[node_id] for node_id in best if node_id != item.id]
+    budget.spend(len(around))
+    parts: list[_Part] = []
     others = _things(around, condition.thing, condition.colour)
-    parts = [
-        part
-        for other, chance, of_colour in sorted(others, key=lambda one: one[0].id)
-        if (
-            part := _part(
-                graph,
-                item,
-                condition,
-                other,
-                chance * of_colour,
-                of_colour if is_certain else chance * of_colour,
-            )
-        )
-    ]
+    for other, chance, of_colour in sorted(others, key=lambda one: one[0].id):
+        counted_chance = of_colour if is_certain else chance * of_colour
+        chance = chance * of_colour
+        of = f"{other.name} ({chance:.0%})" if condition.thing is not None else other.name
+        if condition.predicate is None:
+            parts.append((counted_chance, None, f"{distance_m(item, other):.2f} m from {of}"))
+            continue
+        relation = best[other.id]
+        said = relation.predicate if relation.subject.id == item.id else condition.predicate
+        text = f"{said} {of}: {relation.probability:.0%}, {relation.evidence}"
+        parts.append((counted_chance * relation.probability, relation, text))
     return max(parts, key=lambda part: part[0], default=None)
-
-
-def _part(
-    graph: SceneGraph,
-    item: SceneObject,
-    condition: Condition,
-    other: SceneObject,
-    chance: float,
-    counted_chance: float,
-) -> _Part | None:
-    of = f"{other.name} ({chance:.0%})" if condition.thing is not None else other.name
-    if condition.predicate is None:
-        return counted_chance, None, f"{distance_m(item, other):.2f} m from {of}"
-    found = graph.relations(item, condition.predicate, other)
-    if not found and condition.predicate in UNDER:
-        found = graph.relations(other, "on", item)
-    if not found:
-        return None
-    relation = found[0]
-    said = relation.predicate if relation.subject.id == item.id else condition.predicate
-    text = f"{said} {of}: {relation.probability:.0%}, {relation.evidence}"
-    return counted_chance * relation.probability, relation, text

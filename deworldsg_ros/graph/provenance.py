@@ -102,6 +102,7 @@ class SeenSpace:
     def move(self, T_correction: Float64, since_ns: int) -> None:
         """Apply a pose-graph correction (4, 4) to the views since a stamp."""
         since = self.stamps_ns >= since_ns
+        self.poses = self.poses.copy()  # a copy of this object keeps the arrays of its moment
         self.poses[since] = T_correction @ self.poses[since]
 
     def arrays(self) -> dict[str, NDArray[Any]]:

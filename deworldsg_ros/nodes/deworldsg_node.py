@@ -37,7 +37,7 @@ class DeworldsgNode(PerceivingNode):
         self._lifting.warm_up()
         self._relating = Relating(self, self._deliver)
         self.graph = GraphKeeper(self, markers, self._updated)
-        GraphServices(self, self.graph)
+        self._answers = GraphServices(self, self.graph)
         self.listen_to_camera(self._process)
 
     def _process(self, frame: RgbdFrame) -> None:
@@ -77,6 +77,7 @@ class DeworldsgNode(PerceivingNode):
         """End the threads, and write the map file."""
         super().close()
         self._relating.close()
+        self._answers.close()
         self.graph.close()
 
 

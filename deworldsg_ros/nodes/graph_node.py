@@ -33,7 +33,7 @@ class GraphNode(StageNode):
         self.graph = GraphKeeper(
             self, markers, lambda _, latency_s: self.health.published(latency_s)
         )
-        GraphServices(self, self.graph)
+        self._answers = GraphServices(self, self.graph)
         self._received_s = time.monotonic()
         self.listen_json(
             "deworldsg/local_graph", wire.LocalGraphMessage, self._integrate, 50, self._receive
@@ -52,6 +52,7 @@ class GraphNode(StageNode):
 
     def close(self) -> None:
         """Write the map file."""
+        self._answers.close()
         self.graph.close()
         super().close()
 

@@ -8,6 +8,7 @@ which has the fields of such a service: the request is JSON in `load_namespace`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +16,7 @@ from typing import Annotated, Any
 import msgspec
 from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import PoseStamped
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
@@ -28,12 +30,18 @@ from deworldsg_ros.map_file import read_map
 from deworldsg_ros.ros.graph_keeper import GraphKeeper
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.ros.threads import Worker
 from deworldsg_ros.scene.errors import DeWorldSGError, RefusedInput
 from deworldsg_ros.wire.messages import Point
 
 GOAL_TOPIC = "deworldsg/goal"
 # A question is a line. An edit is a few numbers.
 MAX_REQUEST_CHARACTERS = 10_000
+# Requests of all services that may wait for their answers. More are told so at once.
+MOST_WAITING = 8
+BUSY = f"busy: {MOST_WAITING} requests wait for their answers; try again"
+# DDS keeps so many requests until the node has looked at them; more are lost without an answer.
+REQUEST_DEPTH = 1000
 
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
 
@@ -69,11 +77,16 @@ class Load(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     path: Text
 
 
-class GraphServices:
-    """Answers each request in the graph's thread, between two frames.
+# Answers a request in the graph's thread: a text, or what else makes the text, in another thread.
+_Answer = Callable[[Any], "str | Callable[[], str]"]
 
-    A request that cannot be answered changes nothing. It is counted as ``invalid_request``, and the
-    answer says why.
+
+class GraphServices:
+    """Answers requests: edits and files in the graph's thread, between two frames.
+
+    A question takes the graph of its moment there. It is answered in a thread of its own, so that
+    frames do not wait. A request that cannot be answered changes nothing. It is counted as
+    ``invalid_request``, and the answer says why.
 
     Args:
         node: has the services.
@@ -84,7 +97,13 @@ class GraphServices:
         self._node = node
         self._graph = graph
         self._publish_goal = node.create_publisher(PoseStamped, GOAL_TOPIC, reliable(1)).publish
-        services: Sequence[tuple[str, Any, Callable[[Any], str]]] = (
+        self._waiting = 0
+        # In their group, no subscription would be served while an answer is awaited.
+        self._group = ReentrantCallbackGroup()
+        self._questions: Worker[Callable[[], None]] = Worker(
+            "questions", lambda job: job(), size=MOST_WAITING, on_overrun=lambda job: None
+        )
+        services: Sequence[tuple[str, Any, _Answer]] = (
             ("query", Query, self._query),
             ("goal_near", GoalNear, self._goal_near),
             ("explain", Explain, self._explain),
@@ -100,32 +119,55 @@ class GraphServices:
         self._serve("clear", Trigger, lambda text: self._clear())
         self._serve("undo", Trigger, lambda text: self._edit(Undo()))
 
-    def _serve(self, name: str, kind: Any, answer: Callable[[str], str]) -> None:
+    def close(self) -> None:
+        """End the thread of the questions."""
+        self._questions.stop()
+
+    def _serve(self, name: str, kind: Any, answer: _Answer) -> None:
         async def call(request: Any, response: Any) -> Any:
+            if self._waiting >= MOST_WAITING:
+                response.success, response.message = False, BUSY
+                return response
             done = Future()
             text = getattr(request, "load_namespace", "")
-            self._graph.submit(
-                lambda: self._answer(name, partial(answer, text), done),
-                lambda: done.set_result((False, "too many messages wait: try again")),
-            )
-            response.success, response.message = await done
+            self._waiting += 1  # only the executor's thread counts
+            try:
+                self._graph.submit(
+                    lambda: self._answer(name, partial(answer, text), done),
+                    lambda: self._done(done, (False, "too many messages wait: try again")),
+                )
+                response.success, response.message = await done
+            finally:
+                self._waiting -= 1
             return response
 
-        self._node.create_service(kind, f"~/{name}", call)
+        qos = reliable(REQUEST_DEPTH)
+        self._node.create_service(
+            kind, f"~/{name}", call, qos_profile=qos, callback_group=self._group
+        )
+
+    def _answer(self, name: str, answer: Any, done: Future) -> None:
+        """Call `answer`; a text is the answer, a function is called in the questions' thread."""
+        result: tuple[bool, str] | None = (False, "internal error: see /diagnostics")
+        with self._node.refusing():
+            try:
+                said = answer()
+            except (DeWorldSGError, OSError) as error:
+                self._node.drop("invalid_request", f"{name}: {error}")
+                result = (False, str(error))
+            else:
+                result = None if callable(said) else (True, said)
+                if callable(said):
+                    self._questions.submit(partial(self._answer, name, said, done))
+        if result is not None:
+            self._done(done, result)
+
+    def _done(self, done: Future, result: tuple[bool, str]) -> None:
+        done.set_result(result)
+        if self._node.executor is not None:
+            self._node.executor.wake()
 
     # The methods below run in the graph's thread.
-
-    def _answer(self, name: str, answer: Callable[[], str], done: Future) -> None:
-        result = (False, "internal error: see /diagnostics")
-        try:
-            result = (True, answer())
-        except (DeWorldSGError, OSError) as error:
-            self._node.drop("invalid_request", f"{name}: {error}")
-            result = (False, str(error))
-        finally:
-            done.set_result(result)
-            if self._node.executor is not None:
-                self._node.executor.wake()
 
     @property
     def _builder(self) -> GraphBuilder:
@@ -137,18 +179,24 @@ class GraphServices:
         builder = self._builder
         return SceneGraph(builder.full(), builder.frames.all(builder.graph))
 
-    def _query(self, request: Query) -> str:
-        return _json(ask(self._asked(), request.question).to_dict())
+    def _query(self, request: Query) -> Callable[[], str]:
+        graph = self._asked()
+        return lambda: _json(ask(graph, request.question).to_dict())
 
-    def _goal_near(self, request: GoalNear) -> str:
-        x, y, z = request.towards or (0.0, 0.0, 0.0)
-        towards = None if request.towards is None else (x, y, z)
-        goal: Goal = self._asked().goal_near(
-            request.object, request.distance_m, towards=towards, space=self._builder.space
-        )
-        if request.publish:
-            self._publish_goal(goal.pose_stamped())
-        return _json(goal.to_dict())
+    def _goal_near(self, request: GoalNear) -> Callable[[], str]:
+        graph, space = self._asked(), copy(self._builder.space)
+
+        def answer() -> str:
+            x, y, z = request.towards or (0.0, 0.0, 0.0)
+            towards = None if request.towards is None else (x, y, z)
+            goal: Goal = graph.goal_near(
+                request.object, request.distance_m, towards=towards, space=space
+            )
+            if request.publish:
+                self._publish_goal(goal.pose_stamped())
+            return _json(goal.to_dict())
+
+        return answer
 
     def _explain(self, request: Explain) -> str:
         what = request.object if request.other is None else (request.object, request.other)
@@ -187,7 +235,7 @@ class GraphServices:
         return f"{len(graph)} nodes are cleared"
 
 
-def _parsed(kind: Any, answer: Callable[[Any], str], text: str) -> str:
+def _parsed(kind: Any, answer: _Answer, text: str) -> str | Callable[[], str]:
     if len(text) > MAX_REQUEST_CHARACTERS:
         raise RefusedInput(
             "invalid_request",

@@ -118,7 +118,9 @@ class Waiting:
             if (ready := wait_set.get_ready_entities(kind))
             for item in items
         ):
-            self._executor.spin_once(timeout_sec=0)
+            # One call serves one of them, and each request that still waits for its answer is one.
+            for _ in range(1 + len(self._executor._tasks)):
+                self._executor.spin_once(timeout_sec=0)
 
 
 # --- What a node says about itself: the message of /diagnostics, and log lines of drops.

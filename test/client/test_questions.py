@@ -1,14 +1,16 @@
 """Questions in words."""
 
 import re
+import time
 from dataclasses import replace
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
+from support.view import box_at, make_edge, make_graph, make_node
 
-from deworldsg_ros.client import ClientError, SceneGraph
+from deworldsg_ros.client import ClientError, SceneGraph, questions
 from deworldsg_ros.client.grammar import Condition, Pattern, Rank, Since, parse
 from deworldsg_ros.client.meanings import COLOURS, colour_name, colour_shares
 from deworldsg_ros.client.questions import ask
@@ -272,3 +274,45 @@ def test_a_graph_without_colours_says_so(room):
     answers = ask(room, "the red mug")
     assert answers.found == () and any("no object of the graph has a" in n for n in answers.notes)
     assert room[13].colour is room[13].colour_lab is None
+
+
+def chairs(count):
+    """Chairs in a row, each near each."""
+    ids = range(1, count + 1)
+    nodes = [make_node(i, "chair", (0.1 * i, 0, 0), box=box_at((0.1 * i, 0, 0))) for i in ids]
+    edges = [make_edge(a, b, "near", 0.9) for a in ids for b in ids if a != b]
+    return SceneGraph(make_graph(nodes, edges))
+
+
+def test_a_condition_that_is_said_again_and_again_counts_once():
+    graph = chairs(20)
+    once, often = (ask(graph, "chair" + count * " near chair") for count in (1, 40))
+    assert [answer.to_dict() for answer in often.found] == [one.to_dict() for one in once.found]
+
+
+def test_a_question_has_a_budget(monkeypatch):
+    graph = chairs(20)
+    question = "chair near chair and not on chair and within 9 m of chair and above chair"
+    assert ask(graph, question).found == ()
+    monkeypatch.setattr(questions, "MOST_COMPARED", 300)
+    with pytest.raises(ClientError, match="takes too long"):
+        ask(graph, question)
+    monkeypatch.undo()
+    monkeypatch.setattr(questions, "LIMIT_S", 0.0)
+    with pytest.raises(ClientError, match="takes too long"):
+        ask(graph, question)
+
+
+@pytest.mark.parametrize("text", ["(" * 500_000, "ab " * 160_000, "x" * 500_000])
+def test_endless_names_are_refused_at_once(text):
+    graph, started_s = chairs(3), time.monotonic()
+    asked = (graph.understand, graph.objects, graph.explain, graph.goal_near, graph.one)
+    for call in (*asked, lambda name: ask(graph, name)):
+        with pytest.raises(ClientError, match="expected"):
+            call(text)
+    assert time.monotonic() - started_s < 5.0  # seconds of a busy machine; it was minutes
+
+
+def test_too_many_conditions_are_refused():
+    with pytest.raises(ClientError, match="9 conditions: expected at most 8"):
+        parse("cup" + "".join(f" and within {i} m of table" for i in range(1, 10)))

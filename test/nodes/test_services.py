@@ -3,6 +3,7 @@
 import json
 import shlex
 import shutil
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -19,11 +20,14 @@ from support.surfaces import CUP, HERE, TABLE, slab, view
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import ClientError, SceneGraphClient
 from deworldsg_ros.client.mcp_server import EditTools, GraphTools
+from deworldsg_ros.client.questions import ask
 from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map
 from deworldsg_ros.nodes.graph_node import GraphNode
+from deworldsg_ros.ros import graph_services
+from deworldsg_ros.ros.graph_services import BUSY
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.wire.codec import local_graph_to_message
 
@@ -224,6 +228,32 @@ def test_a_bad_request_is_refused_counted_and_changes_nothing(robot, service, re
     assert says in answer.message
     assert robot.refusals() == 1
     assert graph() == before
+
+
+def test_frames_do_not_wait_for_questions_and_further_ones_are_told_that_it_is_busy(
+    robot, monkeypatch
+):
+    asked, go_on = threading.Event(), threading.Event()
+
+    def slow(graph, question):
+        asked.set()
+        assert go_on.wait(LIMIT_S)
+        return ask(graph, question)
+
+    monkeypatch.setattr(graph_services, "ask", slow)
+    client = robot.peer.node.create_client(AddDiagnostics, "/graph_node/query")
+    robot.expect(client.service_is_ready, "the service")
+    request = AddDiagnostics.Request(load_namespace='{"question": "cup"}')
+    calls = [client.call_async(request) for _ in range(40)]
+    robot.expect(asked.is_set, "the first question")
+    robot.see(2)  # the graph takes frames
+    waiting = graph_services.MOST_WAITING
+    robot.expect(lambda: sum(call.done() for call in calls) == 40 - waiting, "the refusals")
+    assert all(call.result().message == BUSY for call in calls if call.done())
+    go_on.set()
+    robot.expect(lambda: all(call.done() for call in calls), "the answers")
+    assert sum(call.result().success for call in calls) == waiting
+    assert robot.call(AddDiagnostics, "/graph_node/query", request).success
 
 
 def test_the_calls_in_the_documentation_work(robot, root_dir):
