@@ -418,7 +418,7 @@ class ReplayNode(Node):
 
     Args:
         stop: set by a signal.
-        stop_early: set by `replaying.STOP_EARLY`.
+        stop_early: set by `replaying.STOP_EARLY`; None = never.
         options: arguments of rclpy's Node.
 
     Raises:
@@ -426,10 +426,12 @@ class ReplayNode(Node):
         RecordingError: for a recording that cannot be read.
     """
 
-    def __init__(self, stop: threading.Event, stop_early: threading.Event, **options: Any) -> None:
+    def __init__(
+        self, stop: threading.Event, stop_early: threading.Event | None = None, **options: Any
+    ) -> None:
         super().__init__("replay_node", **options)
         self._stop = stop
-        self._stop_early = stop_early
+        self._stop_early = stop_early or threading.Event()
         parameters = declare(self, ReplayParameters)
         self._options = parameters.node
         self._executor = SingleThreadedExecutor()
