@@ -21,11 +21,14 @@ from deworldsg_ros.base.files import (
     check_writable,
     parse_json,
     paused_collector,
+    read_regular,
+    write_atomically,
 )
-from deworldsg_ros.base.words import counted
+from deworldsg_ros.base.words import counted, whole_number
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.nodes import MAX_ID
 from deworldsg_ros.graph.provenance import FrameMemory, SeenFrames
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
 from deworldsg_ros.merging.editing import EditReply
@@ -36,6 +39,8 @@ from deworldsg_ros.scene.frame_graph import Vocabulary
 
 # Before the names of the arrays of merging.
 _MERGING = "merging."
+# So many ids are reserved at once, each time with a small file on the disk.
+RESERVED_IDS = 100
 
 
 def write_map(builder: GraphBuilder, path: Path) -> None:
@@ -70,6 +75,31 @@ def previous_of(path: Path) -> Path:
     return path.with_name(f"{path.name}.previous")
 
 
+def ids_of(path: Path) -> Path:
+    """Path of the file that says from which id on no node of the map `path` was ever published."""
+    return path.with_name(f"{path.name}.ids")
+
+
+def write_first_id(path: Path, first_id: int) -> None:
+    """Say from which id on no node of a map was ever published; then it is on the disk.
+
+    Raises:
+        ConfigurationError: if the file cannot be written.
+    """
+    with _writing(path):
+        write_atomically(ids_of(path), f"{first_id}\n")
+
+
+def first_id(path: Path) -> int:
+    """The id of `write_first_id`; 1 without a file, or if it contains no number."""
+    try:
+        text = read_regular(ids_of(path), len(str(MAX_ID)) + 1).decode()
+    except (OSError, ValueError):  # no number is no reason not to start
+        return 1
+    number = whole_number(text.strip())
+    return number if number is not None and 1 <= number <= MAX_ID + 1 else 1
+
+
 def check_paths(map_path: Path | None, others: Iterable[tuple[str, Path]]) -> None:
     """Test that a map, the generation before it, and what is written beside it are different files.
 
@@ -83,6 +113,7 @@ def check_paths(map_path: Path | None, others: Iterable[tuple[str, Path]]) -> No
     files = list(others)
     if map_path is not None:
         files += [("the map", map_path), ("the map's previous generation", previous_of(map_path))]
+        files.append(("the map's ids", ids_of(map_path)))
     try:
         check_different(files)
     except ValueError as error:
@@ -118,6 +149,8 @@ class Continued:
 def continue_map(config: Config, path: Path) -> Continued | None:
     """Continue with the newest generation of a map that is whole; the caller has claimed it.
 
+    No id that was ever published from this map is given to another node.
+
     Returns:
         None if there is no map yet.
 
@@ -137,7 +170,9 @@ def continue_map(config: Config, path: Path) -> Continued | None:
             # The next write must not put it in place of the generation that is whole.
             path.replace(path.with_name(f"{path.name}.broken"))
         message = f"{error}. Continuing the map before it, {previous}: {_size(builder)}"
+        builder.graph.skip_to(first_id(path))
         return Continued(builder, message, newest=False)
+    builder.graph.skip_to(first_id(path))
     return Continued(builder, f"continuing map {path}: {_size(builder)}", newest=True)
 
 

@@ -296,7 +296,13 @@ class SceneGraphClient:
         return self._call("load", {"path": path})
 
     def command(self, service: str, **request: Any) -> dict[str, Any]:
-        """Call a service that takes and answers JSON."""
+        """Call a service that takes and answers JSON.
+
+        Ids are those of the session of this copy. A node whose graph has begun anew refuses them.
+        """
+        session = self._replica.session
+        if session and any(name in request for name in ("node", "nodes", "object")):
+            request["session"] = session
         answer: dict[str, Any] = json.loads(self._call(service, request))
         return answer
 

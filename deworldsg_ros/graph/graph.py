@@ -172,8 +172,9 @@ class GlobalGraph:
 
         Raises:
             ValueError: if the covariance is not positive definite.
+            RefusedInput: ``no_ids_left``.
         """
-        nodes, node_id = self.nodes, self._ids.next_id
+        nodes, node_id = self.nodes, self._ids.take()
         slot = nodes.add(node_id)
         try:
             classes = class_probabilities / class_probabilities.sum()
@@ -185,7 +186,7 @@ class GlobalGraph:
         nodes.set_surface(slot, surface_points_world)
         nodes.first_seen_ns[slot] = nodes.last_seen_ns[slot] = stamp_ns
         self._changed([slot])
-        return self._ids.take()
+        return node_id
 
     def observe(
         self,
@@ -301,6 +302,15 @@ class GlobalGraph:
         if self.embeddings.views:
             self.embeddings.turn(node_id, T_correction[:3, :3])
         self._changed([slot])
+
+    @property
+    def next_id(self) -> int:
+        """Id of the next node."""
+        return self._ids.next_id
+
+    def skip_to(self, next_id: int) -> None:
+        """Give out no id below this one: those may be known for other nodes."""
+        self._ids.skip_to(next_id)
 
     def resolve(self, node_id: int) -> int:
         """The live node that an id stands for, following merges; 0 = none."""

@@ -16,8 +16,8 @@ from deworldsg_ros.base.array_file import Arrays, read_arrays, write_arrays
 from deworldsg_ros.base.files import parse_json, paused_collector, read_regular, write_atomically
 from deworldsg_ros.graph.edits import MAX_EDITS, Edit
 from deworldsg_ros.graph.graph import GlobalGraph, GraphState
-from deworldsg_ros.graph.nodes import SAVED, IdState
-from deworldsg_ros.graph.pairs import MAX_ID, PairArrays
+from deworldsg_ros.graph.nodes import MAX_ID, SAVED, IdState
+from deworldsg_ros.graph.pairs import PairArrays
 from deworldsg_ros.scene import limits
 from deworldsg_ros.scene.arrays import Int64
 from deworldsg_ros.scene.checks import (

@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.gaussian import (
     eigenvalue_bound,
     eigenvalue_bounds,
@@ -25,6 +26,8 @@ from deworldsg_ros.scene.surface import add_flat, add_points, drop_points
 
 # --- The ids of nodes over the life of a graph, and the nodes of past frames.
 
+# The largest id: pairs keep theirs in 32 bits.
+MAX_ID = 2**31 - 1
 # With more removed ids than this, those that no remembered frame has are forgotten. An id takes 0.1
 # kB.
 PRUNE_ABOVE = 512
@@ -78,6 +81,10 @@ class NodeIds:
         """Id of the next node."""
         return self._next_id
 
+    def skip_to(self, next_id: int) -> None:
+        """Give out no id below this one: those may be known for other nodes."""
+        self._next_id = max(self._next_id, min(next_id, MAX_ID + 1))
+
     def state(self) -> IdState:
         """A copy of everything that is remembered."""
         return IdState(
@@ -85,7 +92,13 @@ class NodeIds:
         )
 
     def take(self) -> int:
-        """Take the next id; ids are never reused."""
+        """Take the next id; ids are never reused.
+
+        Raises:
+            RefusedInput: ``no_ids_left`` after `MAX_ID`.
+        """
+        if self._next_id > MAX_ID:
+            raise RefusedInput("no_ids_left", f"node {MAX_ID} exists: clear the graph")
         self._next_id += 1
         return self._next_id - 1
 

@@ -28,7 +28,6 @@ from deworldsg_ros.scene.arrays import (
 
 # Subject and object of a directed pair, by their ids.
 Pair = tuple[int, int]
-MAX_ID = 2**31 - 1
 
 # A pair. Its first end is the node with the smaller id. Fields of two values have one for each
 # direction; in direction 0, the first end is the subject.

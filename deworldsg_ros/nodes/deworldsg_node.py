@@ -62,8 +62,9 @@ class DeworldsgNode(PerceivingNode):
         self.graph.submit(lambda: self.graph.configure(self.parameters))
 
     def waiting_for(self, now_ns: int) -> list[str]:
-        """Missing inputs, and models that fail or hang, in words."""
-        return [*super().waiting_for(now_ns), *self._relating.problems()]
+        """Missing inputs, models that fail or hang, and problems of the graph, in words."""
+        missing = super().waiting_for(now_ns)
+        return [*missing, *self._relating.problems(), *self.graph.problems()]
 
     def hung(self) -> str:
         """A model that never returns, in words."""

@@ -67,10 +67,11 @@ class GraphNode(StageNode):
         self.graph.add_evidence(evidence_from_message(message))
 
     def waiting_for(self, now_ns: int) -> list[str]:
-        """The topic of the local graphs, if it is silent."""
+        """The topic of the local graphs, if it is silent, and problems of the graph."""
         silence_s = now_ns / 1e9 - self._received_s
         topic = self.resolve_topic_name("deworldsg/local_graph")
-        return [f"no local_graph on {topic} for {silence_s:.0f} s"] if silence_s > SILENCE_S else []
+        silent = [f"no local_graph on {topic} for {silence_s:.0f} s"]
+        return [*(silent if silence_s > SILENCE_S else []), *self.graph.problems()]
 
     def more_values(self) -> dict[str, str]:
         """The size of the graph."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Union
 
+import msgspec
 from geometry_msgs.msg import PoseStamped
+from std_msgs.msg import String
 
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.base.files import write_atomically
@@ -18,11 +22,14 @@ from deworldsg_ros.graph.embeddings import embeddings_path, write_embeddings
 from deworldsg_ros.graph.provenance import path_beside, space_path, write_seen, write_space
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.map_file import (
+    RESERVED_IDS,
     Continued,
     check_paths,
     claim_map,
     continue_map,
     copy_state,
+    first_id,
+    write_first_id,
     write_map,
     write_state,
 )
@@ -44,13 +51,16 @@ from deworldsg_ros.wire import messages as wire
 MAX_SHARE = 0.02
 # Longest time in which a disk may take a checkpoint, before the map itself is written.
 SLOW_DISK_S = 20.0
+# A checkpoint that failed is tried again after this time, also if the graph does not change.
+RETRY_S = 10.0
 
 
 class MapKeeper:
     """Owns a map file; no other process may write it until `close`.
 
     A node that is killed has lost at most the last period: its graph is copied in the graph's
-    thread, and written in another.
+    thread, and written in another. Ids that it had published are not given to other nodes: they are
+    reserved on the disk before.
 
     Args:
         node: for the log and the counts.
@@ -66,7 +76,10 @@ class MapKeeper:
         self._node = node
         self._period_s = period_s
         self._due_s: float | None = None  # None = nothing changed since the last checkpoint
+        self._look_again_s: float | None = None  # None = the last checkpoint was written
         self._copying_s = 0.0
+        self._problem = ""
+        self._unreserved_id = 0
         self._lock = claim_map(path)
         self._worker: Worker[Arrays] = Worker(
             "map", self._write, size=1, on_overrun=lambda state: None
@@ -86,15 +99,43 @@ class MapKeeper:
             self._due_s = time.monotonic() + max(self._period_s, self._copying_s / MAX_SHARE)
 
     def wait_s(self, now_s: float) -> float | None:
-        """Seconds until the next checkpoint is due, 0 = now; None without a change."""
-        return None if self._due_s is None else max(0.0, self._due_s - now_s)
+        """Seconds until `checkpoint` is due, 0 = now; None without a change."""
+        due_s = [at_s for at_s in (self._due_s, self._look_again_s) if at_s is not None]
+        return max(0.0, min(due_s) - now_s) if due_s else None
 
     def checkpoint(self, builder: GraphBuilder) -> None:
-        """Copy the graph, and write the map in the background."""
-        self._due_s = None
-        started_s = time.monotonic()
-        self._worker.submit(copy_state(builder))
-        self._copying_s = time.monotonic() - started_s
+        """Copy the graph, and write the map in the background; also if the last one failed."""
+        now_s = time.monotonic()
+        is_writing, failed = not self._worker.wait_idle(0.0), bool(self._problem)
+        self._look_again_s = now_s + RETRY_S if is_writing or failed else None
+        if failed or (self._due_s is not None and self._due_s <= now_s):
+            self._due_s, self._look_again_s = None, now_s + RETRY_S
+            self._worker.submit(copy_state(builder))
+            self._copying_s = time.monotonic() - now_s
+
+    @property
+    def first_id(self) -> int:
+        """The first id that no node of this map was ever published with."""
+        return first_id(self.path)
+
+    def reserve(self, next_id: int) -> None:
+        """Call this before ids below `next_id` are published."""
+        if next_id > self._unreserved_id:
+            # Also after a failure: a full disk is not asked again for each node.
+            self._unreserved_id = next_id + RESERVED_IDS
+            try:
+                write_first_id(self.path, self._unreserved_id)
+            except ConfigurationError as error:
+                self._node.drop("ids_not_reserved", str(error))
+
+    def release(self, next_id: int) -> None:
+        """Say that no id from `next_id` on was published; the map has been written."""
+        with suppress(ConfigurationError):  # then some ids are left out
+            write_first_id(self.path, next_id)
+
+    def problems(self) -> list[str]:
+        """Why the map is not written, in words."""
+        return [f"{self._problem}; tried again every {RETRY_S:g} s"] if self._problem else []
 
     def save(self, builder: GraphBuilder | None) -> tuple[bool, str]:
         """Write the map now; returns whether it was written, and a sentence."""
@@ -106,7 +147,8 @@ class MapKeeper:
             write_map(builder, self.path)
         except ConfigurationError as error:
             return False, str(error)
-        self._due_s = None
+        self._due_s = self._look_again_s = None
+        self._problem = ""
         return True, f"map {self.path}: {counted(builder.confirmed, 'node')}"
 
     def close(self) -> None:
@@ -119,7 +161,10 @@ class MapKeeper:
             try:
                 write_state(state, self.path)
             except ConfigurationError as error:
+                self._problem = str(error)
                 self._node.drop("map_not_written", str(error))
+            else:
+                self._problem = ""
 
 
 # --- The files of a node's graph: its map, and the JSON that ~/save writes.
@@ -210,6 +255,8 @@ class GraphFiles:
         written, message = False, f"map {self.map.path}: not written, the graph is busy"
         if not busy:
             written, message = self.map.save(builder)
+        if written and builder is not None:
+            self.map.release(builder.graph.next_id)
         self.map.close()
         log = self._node.get_logger()
         log.info(message) if written else log.warning(message)
@@ -255,6 +302,64 @@ class PoseCorrections:
             "pose corrections": str(self._corrections),
             "nodes moved by corrections": str(self._nodes),
         }
+
+
+# --- Another node that publishes a graph on the same topics.
+
+UPDATES_TOPIC = "scene_graph/updates"
+# It has ended if it is silent for this time.
+RIVAL_SILENT_S = 10.0
+
+
+class _Named(msgspec.Struct):
+    """What is read of an update."""
+
+    session: Union[str, msgspec.UnsetType] = msgspec.UNSET
+
+
+class Rivals:
+    """Notices another node that publishes updates on the topic of this one: clients see two graphs.
+
+    The middleware also lists publishers of a node that was killed, for a while. So the topic is
+    listened to while it has several publishers, and a message of another session counts.
+
+    Args:
+        node: publishes the updates.
+        session: of its messages.
+    """
+
+    def __init__(self, node: StageNode, session: Callable[[], str]) -> None:
+        self._node, self._session = node, session
+        self._topic = node.resolve_topic_name(UPDATES_TOPIC)
+        self._subscription: Any = None
+        self._heard_s = -math.inf
+
+    def problems(self) -> list[str]:
+        """That there is one, in words. Call it about once a second, in the executor's thread."""
+        several = self._node.count_publishers(self._topic) > 1
+        if several and self._subscription is None:
+            listen = self._node.guarded(self._hear)
+            self._subscription = self._node.create_subscription(
+                String, self._topic, listen, reliable(5)
+            )
+        elif not several and self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+        if time.monotonic() - self._heard_s > RIVAL_SILENT_S:
+            return []
+        return [
+            f"another node publishes a graph on {self._topic}: end one of the two, or give it a "
+            "namespace"
+        ]
+
+    def _hear(self, message: Any) -> None:
+        try:
+            session = msgspec.json.decode(message.data, type=_Named).session
+        except (msgspec.MsgspecError, UnicodeError, RecursionError):
+            session = msgspec.UNSET
+        if session != self._session():
+            self._heard_s = time.monotonic()
+            self._node.drop("other_session", f"a message of another node on {self._topic}")
 
 
 # --- The global graph of a node, in a thread of its own: merged, published, saved.
@@ -309,7 +414,8 @@ class GraphKeeper:
         self._values: dict[str, str] = {}
         self._times = UpdateTimes(self._node.parameters.output.rate_hz)
         self._running_s = 0.0  # when the job that runs now was submitted
-        self._publish_update = node.json_publisher("scene_graph/updates", 50)
+        self._publish_update = node.json_publisher(UPDATES_TOPIC, 50)
+        self._rivals = Rivals(node, lambda: self._session)
         self._whole = WholeGraph(node, markers)
         self._embeddings = EmbeddingTopic(node)
         self.files = GraphFiles(node)
@@ -355,6 +461,11 @@ class GraphKeeper:
         self._whole.close()
         self.files.close(self._builder, busy=not ended)
 
+    def problems(self) -> list[str]:
+        """What is wrong with the map, and on the topics, in words."""
+        of_map = [] if self.files.map is None else self.files.map.problems()
+        return [*of_map, *self._rivals.problems()]
+
     def values(self) -> dict[str, str]:
         """The size of the graph, for /diagnostics."""
         if not self._values:
@@ -373,8 +484,15 @@ class GraphKeeper:
         """The graph; None before the first frame."""
         return self._builder
 
+    @property
+    def session(self) -> str:
+        """Of the messages: ids of another one may name other objects."""
+        return self._session
+
     def replace(self, builder: GraphBuilder) -> None:
         """Continue with another graph: clients see a new session."""
+        if self._builder is not None:
+            builder.graph.skip_to(self._builder.graph.next_id)
         self._builder, self._session = builder, secrets.token_hex(8)
         self.newest_ns, self._clock, self._pending = 0, ClockGate(), PendingEvidence()
         self._whole.changed(not builder.confirmed)  # objects appear with their first update
@@ -398,6 +516,8 @@ class GraphKeeper:
         """Merge a local graph, and the evidence that waited for it."""
         if self._builder is None:
             self._builder = GraphBuilder(self._node.parameters, local.vocabulary, local.frame_id)
+            if self.files.map is not None:  # no map, but a run before may have published some
+                self._builder.graph.skip_to(self.files.map.first_id)
         self._builder.integrate(local)
         for reason, message in self._builder.refused.items():
             self._node.drop(reason, message)
@@ -458,6 +578,8 @@ class GraphKeeper:
             self._times.changed(now_s, now_s, can_wait=update is not None)
         if update is None:
             return
+        if self.files.map is not None:
+            self.files.map.reserve(self._builder.graph.next_id)
         update.session = self._session
         self._publish_update(update)
         self._whole.changed()

@@ -114,7 +114,7 @@ class GraphServices:
             ("delete", DeleteNode, self._edit),
         )
         for name, kind, answer in services:
-            self._serve(name, AddDiagnostics, partial(_parsed, kind, answer))
+            self._serve(name, AddDiagnostics, partial(self._parsed, kind, answer))
         self._serve("save", Trigger, lambda text: self._save())
         self._serve("clear", Trigger, lambda text: self._clear())
         self._serve("undo", Trigger, lambda text: self._edit(Undo()))
@@ -168,6 +168,30 @@ class GraphServices:
             self._node.executor.wake()
 
     # The methods below run in the graph's thread.
+
+    def _parsed(self, kind: Any, answer: _Answer, text: str) -> str | Callable[[], str]:
+        if len(text) > MAX_REQUEST_CHARACTERS:
+            raise RefusedInput(
+                "invalid_request",
+                f"request of {len(text)} characters: expected at most {MAX_REQUEST_CHARACTERS}",
+            )
+        try:
+            values = parse_json(text.encode(), dict[str, Any])
+            session = values.pop("session", None)
+            request = msgspec.convert(values, kind)
+        except ValueError as error:
+            fields = ", ".join(field.name for field in msgspec.structs.fields(kind))
+            raise RefusedInput(
+                "invalid_request", f"request {text[:80]!r}: {error}; expected JSON with {fields}"
+            ) from error
+        if session not in (None, self._graph.session):
+            raise RefusedInput(
+                "other_session",
+                f"request of session {str(session)[:80]!r}: the graph is of session "
+                f"'{self._graph.session}' now, where an id may be that of another object; read the "
+                "graph again",
+            )
+        return answer(request)
 
     @property
     def _builder(self) -> GraphBuilder:
@@ -233,22 +257,6 @@ class GraphServices:
         graph = self._builder.graph
         self._graph.replace(GraphBuilder(self._node.parameters, graph.vocabulary, graph.frame_id))
         return f"{len(graph)} nodes are cleared"
-
-
-def _parsed(kind: Any, answer: _Answer, text: str) -> str | Callable[[], str]:
-    if len(text) > MAX_REQUEST_CHARACTERS:
-        raise RefusedInput(
-            "invalid_request",
-            f"request of {len(text)} characters: expected at most {MAX_REQUEST_CHARACTERS}",
-        )
-    try:
-        request = parse_json(text.encode(), kind)
-    except ValueError as error:
-        fields = ", ".join(field.name for field in msgspec.structs.fields(kind))
-        raise RefusedInput(
-            "invalid_request", f"request {text[:80]!r}: {error}; expected JSON with {fields}"
-        ) from error
-    return answer(request)
 
 
 def _json(value: Any) -> str:

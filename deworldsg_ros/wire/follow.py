@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections import deque
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Protocol, TypeVar
 
@@ -288,6 +290,9 @@ class _Parts(dict[Key, tuple[Any, int]]):
 
 # Updates that wait for a snapshot; graph_node's publisher keeps as many.
 MOST_WAITING = 50
+# After another session has begun, messages of the one before may still be under way for this time.
+# Later ones are of a second node. A session has ended when it is silent for SILENT_S.
+LATE_S, SILENT_S = 2.0, 10.0
 
 
 class Copy(Protocol):
@@ -315,22 +320,39 @@ class Copy(Protocol):
 class GraphFollower:
     """Keeps a copy up to date. After a gap it waits for the next snapshot, about a second.
 
+    A new session is followed: the node was restarted, or its graph replaced. If the session before
+    goes on, two nodes publish on the topics: the first one is followed then, and messages of the
+    other are refused, as long as the first is not silent.
+
     Args:
         copy: an empty copy.
+        clock: seconds.
 
     Attributes:
         gaps: number of times that updates were lost.
         has_graph: whether the copy has a graph.
     """
 
-    def __init__(self, copy: Copy) -> None:
+    def __init__(self, copy: Copy, clock: Callable[[], float] = time.monotonic) -> None:
         self.gaps = 0
         self.has_graph = False
         self._copy = copy
+        self._clock = clock
+        # The session that is followed, when it was heard, and the one before; and another node's.
+        self._session: Any = None
+        self._heard_s = self._left_s = -math.inf
+        self._left: Any = None
+        self._others: set[Any] = set()
         self._waiting: deque[wire.SceneGraphUpdateMessage] = deque(maxlen=MOST_WAITING)
 
     def snapshot(self, snapshot: wire.SceneGraphMessage) -> bool:
-        """Take a message of `/scene_graph`; returns whether the copy has changed."""
+        """Take a message of `/scene_graph`; returns whether the copy has changed.
+
+        Raises:
+            RefusedInput: ``other_session`` for one of a second node.
+        """
+        if not self._is_followed(snapshot.session):
+            return False
         same = self.has_graph and (snapshot.session or None) == self._copy.session
         if same and snapshot.sequence <= self._copy.sequence:
             return False
@@ -339,11 +361,18 @@ class GraphFollower:
         # Updates that came during the gap, and are newer than the snapshot.
         waiting, self._waiting = self._waiting, deque(maxlen=MOST_WAITING)
         for update in waiting:
-            self.update(update)
+            if update.session == snapshot.session:
+                self.update(update)
         return True
 
     def update(self, update: wire.SceneGraphUpdateMessage) -> bool:
-        """Take a message of `/scene_graph/updates`; returns whether the copy has changed."""
+        """Take a message of `/scene_graph/updates`; returns whether the copy has changed.
+
+        Raises:
+            RefusedInput: ``other_session`` for one of a second node.
+        """
+        if not self._is_followed(update.session):
+            return False
         try:
             applied = self._copy.apply(update)
         except RefusedInput:
@@ -352,3 +381,23 @@ class GraphFollower:
             return False
         self.has_graph |= applied
         return applied
+
+    def _is_followed(self, session: Any) -> bool:
+        """Whether to take a message of a session; false for a late one of the session before."""
+        now_s = self._clock()
+        if session != self._session and self._heard_s > -math.inf:
+            if session in self._others and now_s - self._heard_s < SILENT_S:
+                raise RefusedInput(
+                    "other_session",
+                    f"session {session!r} is of a second node that publishes a graph on the same "
+                    f"topics; session {self._session!r} is followed. End one of the two nodes, or "
+                    "give it a namespace",
+                )
+            if session == self._left:
+                if now_s - self._left_s < LATE_S:
+                    return False
+                self._others.add(self._session)
+            self._others.discard(session)
+            self._left, self._left_s = self._session, now_s
+        self._session, self._heard_s = session, now_s
+        return True

@@ -57,7 +57,15 @@ def kill_and_restart(rig: Rig, name: str) -> Recovery:
         # A node can be merged into another, or be seen to be gone, before the first whole graph.
         if len(lost) > 0.1 * len(kept):
             problem = f"ids {lost} of {len(kept)} are lost"
+        if again := given_again(rig, kept):
+            problem = f"ids {sorted(again)} are given again"
     return Recovery(name, ready_s - started_s, time.monotonic() - ready_s, problem)
+
+
+def given_again(rig: Rig, kept: set[int]) -> set[int]:
+    """Ids of the newest session that one before had published, and that no checkpoint has kept."""
+    *before, newest = rig.published.values()
+    return newest & set().union(*before) - kept
 
 
 def kept_ids(rig: Rig) -> set[int]:

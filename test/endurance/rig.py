@@ -16,7 +16,6 @@ from deworldsg_ros.wire import messages as wire
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 RECORDING = ROOT / "bags" / "demo_room"
-MAP_PERIOD_S = 1.0
 # Frames that may wait for their results, while there are results at all.
 WINDOW_FRAMES = 3
 SILENCE_S = 1.0
@@ -35,6 +34,7 @@ class Rig:
         self.peer = Peer("endurance")
         self.graph: wire.SceneGraphMessage | None = None  # the newest whole one
         self.updates = 0
+        self.published: dict[str, set[int]] = {}  # ids of each session, in updates
         self.values: dict[str, dict[str, str]] = {}  # newest diagnostics of each node
         self._graph_texts = self.peer.collect("/scene_graph", 1, latched=True)
         self._update_texts = self.peer.collect("/scene_graph/updates")
@@ -52,7 +52,7 @@ class Rig:
     def start(self, name: str) -> None:
         folder = self._folder / str(time.monotonic_ns())
         folder.mkdir(parents=True)
-        parameters = {"map_path": f"'{self.map_path}'", "map_period_s": MAP_PERIOD_S}
+        parameters = {"map_path": f"'{self.map_path}'"}
         self.processes[name] = NodeProcess(name, folder, parameters=parameters)
 
     def start_all(self) -> None:
@@ -103,6 +103,10 @@ class Rig:
 
     def _read(self) -> None:
         self.updates += len(self._update_texts)
+        for text in self._update_texts:
+            update = wire.decode(text, wire.SceneGraphUpdateMessage)
+            ids = self.published.setdefault(str(update.session), set())
+            ids.update(node.id for node in update.nodes)
         if self._results:  # a result also ends the frames before it
             self._in_flight, self._result_s = 0, time.monotonic()
         if self._graph_texts:

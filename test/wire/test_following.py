@@ -13,7 +13,13 @@ from support.view import make_edge, make_graph, make_node
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.wire import follow
 from deworldsg_ros.wire import messages as wire
-from deworldsg_ros.wire.follow import ChangeLog, GraphFollower, GraphReplica, empty_scene_graph
+from deworldsg_ros.wire.follow import (
+    SILENT_S,
+    ChangeLog,
+    GraphFollower,
+    GraphReplica,
+    empty_scene_graph,
+)
 
 seeds = st.integers(0, 10_000)
 
@@ -128,6 +134,36 @@ def test_a_gap_waits_for_a_snapshot_and_a_late_start_is_none(first: int | None, 
     assert follower.gaps == gaps and copy.sequence == (first or 0)
     assert follower.snapshot(graph(3))
     assert copy.message() == graph(5)
+
+
+def test_of_two_nodes_on_one_topic_the_first_is_followed() -> None:
+    copy, now_s = GraphReplica(), [0.0]
+    follower = GraphFollower(copy, lambda: now_s[0])
+    assert follower.update(update(1, "a"))
+    # Another session is that of a restarted node, until the first one goes on.
+    now_s[0] = 1.0
+    assert follower.update(update(1, "b")) and copy.session == "b"
+    now_s[0] = 2.0
+    assert not follower.snapshot(graph(3, "a")), "it was under way"
+    now_s[0] = 4.0
+    assert follower.snapshot(graph(5, "a")) and copy.session == "a"
+    for second in range(5, 60):
+        now_s[0] = second
+        with pytest.raises(RefusedInput, match="'b' is of a second node"):
+            follower.snapshot(graph(second, "b"))
+        assert follower.update(update(second + 1, "a"))
+    assert copy.session == "a"
+    # The first node has ended.
+    now_s[0] += SILENT_S
+    assert follower.snapshot(graph(99, "b")) and copy.session == "b"
+
+
+def test_a_new_session_is_followed_at_once() -> None:
+    copy = GraphReplica()
+    follower = GraphFollower(copy, lambda: 0.0)
+    for session in "abcdef":
+        assert follower.update(update(1, session)) and copy.session == session
+        assert follower.update(update(2, session))
 
 
 # --- readers that ask now and then ---------------------------------------------------------------
