@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dis
 import functools
 import hashlib
 import sys
@@ -76,7 +77,7 @@ class _Kernel:
         Numba freezes the values of global names. By itself it looks at the kernel's own file only.
         """
         known = _code_parts(self._function.__code__, self._function.__doc__)
-        for name in self._function.__code__.co_names:
+        for name in _global_names(self._function.__code__):
             known.append(_global_part(self._function.__globals__.get(name)))
         return hashlib.sha256(b"\0".join(known)).digest()
 
@@ -89,6 +90,14 @@ def _code_parts(code: CodeType, documentation: str | None = None) -> list[bytes]
         elif value != documentation:
             parts.append(repr(value).encode())
     return parts
+
+
+def _global_names(code: CodeType) -> list[str]:
+    """The global names that code uses, in order; `co_names` also has those of attributes."""
+    names = [i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"]
+    for value in code.co_consts:
+        names += _global_names(value) if isinstance(value, CodeType) else []
+    return list(dict.fromkeys(names))
 
 
 def _global_part(value: Any) -> bytes:

@@ -65,6 +65,28 @@ def test_threads_may_call_a_kernel_for_the_first_time_together():
     assert (done.stderr, json.loads(done.stdout)) == ("", [[1]] * 4)
 
 
+START = """
+from deworldsg_ros.base.kernels import on_compilation
+from deworldsg_ros.config import Config
+from deworldsg_ros.graph_builder import warm_up
+from deworldsg_ros.lifting.stage import Lifting
+from deworldsg_ros.perception.registry import build_perception
+compiled = []
+on_compilation(lambda: compiled.append(True))
+warm_up(Config())
+Lifting(Config().lifting).warm_up()
+build_perception(Config().perception)
+print(compiled != [])
+"""
+
+
+@pytest.mark.slow
+def test_a_second_start_compiles_nothing():
+    command = [sys.executable, "-c", START]
+    starts = [subprocess.run(command, capture_output=True, text=True, check=True) for _ in "ab"]
+    assert starts[1].stdout.split() == ["False"], starts[1].stderr
+
+
 @pytest.mark.parametrize(
     "modules",
     [
