@@ -159,6 +159,11 @@ class SceneGraphClient:
             self._context.try_shutdown()
 
     @property
+    def session(self) -> str | None:
+        """Of the copy: in another session, ids may name other objects; None before the graph."""
+        return self._replica.session
+
+    @property
     def has_graph(self) -> bool:
         """Whether there is a graph to ask."""
         return self._follower.has_graph

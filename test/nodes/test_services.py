@@ -24,11 +24,13 @@ from deworldsg_ros.client.questions import ask
 from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.map_file import read_map
+from deworldsg_ros.map_file import first_id, read_map
 from deworldsg_ros.nodes.graph_node import GraphNode
-from deworldsg_ros.ros import graph_services
+from deworldsg_ros.ros import graph_keeper, graph_services
 from deworldsg_ros.ros.graph_services import BUSY
 from deworldsg_ros.ros.options import Parameters
+from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.wire.codec import local_graph_to_message
 
 FLOOR = slab((0, 0, 0.95), (1.2, 0.8, 0.01))
@@ -38,9 +40,9 @@ OBJECTS = ((HERE, CUP), (FLOOR, TABLE))
 class Robot(Bench):
     """A graph_node in this process; `ask` calls it from another thread."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, **more):
         files = {"map_path": str(folder / "a.map"), "save_path": str(folder / "a.json")}
-        values = {"output.min_existence": 0.0, "inputs.world_up": "z", **files}
+        values = {"output.min_existence": 0.0, "inputs.world_up": "z", **files, **more}
         super().__init__(GraphNode, {"deworldsg/local_graph": String}, parameters=values)
         self._threads = self.enter_context(ThreadPoolExecutor(1))
         self._seen = 0
@@ -254,6 +256,80 @@ def test_frames_do_not_wait_for_questions_and_further_ones_are_told_that_it_is_b
     robot.expect(lambda: all(call.done() for call in calls), "the answers")
     assert sum(call.result().success for call in calls) == waiting
     assert robot.call(AddDiagnostics, "/graph_node/query", request).success
+
+
+def test_ids_of_a_session_that_is_over_are_refused(robot, client):
+    old = client.session
+    robot.ask(client.clear)
+    robot.see(3)
+    robot.expect(lambda: client.session != old and len(client.graph) == 2, "the new graph")
+    # No id is given again, and the client's own ones are those of the new session.
+    assert min(labels(client)) > 2
+    assert robot.ask(client.delete, max(labels(client)))["kind"] == "delete"
+    for service in ("delete", "explain"):
+        name = {"delete": "node", "explain": "object"}[service]
+        request = AddDiagnostics.Request(load_namespace=json.dumps({name: 3, "session": old}))
+        answer = robot.call(AddDiagnostics, f"/graph_node/{service}", request)
+        assert not answer.success and "read the graph again" in answer.message
+
+
+def test_after_a_kill_no_id_is_given_again(tmp_path):
+    killed, restarted = tmp_path / "a", tmp_path / "b"
+    killed.mkdir()
+    with Robot(killed) as robot:
+        robot.see(5)
+        robot.expect(lambda: (killed / "a.map.ids").exists(), "the reservation")
+        # What a kill would leave: there is no map yet.
+        shutil.copytree(killed, restarted, ignore=shutil.ignore_patterns("*.lock*", ".*"))
+        assert not (restarted / "a.map").exists()
+        published = set(robot.node.graph.builder.graph.nodes.slot_of)
+    with Robot(restarted) as robot:
+        robot.see(5)
+        again = set(robot.node.graph.builder.graph.nodes.slot_of)
+    assert published == {1, 2} and len(again) == 2 and min(again) > 100
+    # The end of a node gives back what was reserved and not used.
+    assert first_id(killed / "a.map") == 3 and first_id(restarted / "a.map") == max(again) + 1
+
+
+@pytest.mark.parametrize("content", ["", "x", "-1", "9" * 30, "\0" * 10**6])
+def test_a_damaged_reservation_is_no_reason_not_to_start(tmp_path, content):
+    (tmp_path / "a.map.ids").write_text(content)
+    with Robot(tmp_path) as robot:
+        robot.see(3)
+        assert set(robot.node.graph.builder.graph.nodes.slot_of) == {1, 2}
+
+
+def test_a_failed_checkpoint_is_tried_again_without_a_change(tmp_path, monkeypatch):
+    written = threading.Event()
+
+    def full_disk(state, path):
+        raise ConfigurationError(f"map {path} cannot be written: No space left on device")
+
+    monkeypatch.setattr(graph_keeper, "RETRY_S", 0.3)
+    monkeypatch.setattr(graph_keeper, "write_state", full_disk)
+    with Robot(tmp_path, **{"map_period_s": 0.1}) as robot:
+        robot.see(5)
+        robot.expect(robot.node.graph.problems, "the failure")
+        assert "No space left on device; tried again every" in robot.node.graph.problems()[0]
+        assert robot.node.waiting_for(time.monotonic_ns()) == robot.node.graph.problems()
+        monkeypatch.setattr(graph_keeper, "write_state", lambda state, path: written.set())
+        robot.expect(written.is_set, "the checkpoint")
+        robot.expect(lambda: not robot.node.graph.problems(), "the end of the problem")
+
+
+def test_another_node_on_the_topic_is_noticed(robot):
+    topic = "scene_graph/updates"
+    publisher = robot.peer.node.create_publisher(String, topic, reliable(10))
+
+    def notices():
+        publisher.publish(String(data='{"schema": "x", "session": "another", "nodes": []}'))
+        return robot.node.graph.problems()
+
+    robot.expect(notices, "the other node")
+    assert robot.node.graph.problems() == [
+        f"another node publishes a graph on /{topic}: end one of the two, or give it a namespace"
+    ]
+    assert robot.node.health.drops["other_session"]
 
 
 def test_the_calls_in_the_documentation_work(robot, root_dir):
