@@ -259,6 +259,13 @@ REASONS: dict[str, str] = {
     "merged without them. Use one model, or begin a new graph (the service `clear`).",
     # Files
     "map_not_written": "A checkpoint of the map could not be written; the file holds the one "
+    "before. It is tried again every 10 s. Make room on the disk, or take another `map_path`.",
+    "ids_not_reserved": "`FILE.ids`, beside the map, could not be written. After a kill, ids that "
+    "were published may be given to other nodes. Make room on the disk.",
+    "no_ids_left": "The graph has given out two billion ids. Clear it.",
+    "other_session": "Two nodes publish a graph on the same topics, or a request names the session "
+    "of a graph that is no more. End one of the two nodes, or give it a namespace; read the graph "
+    "again.",
     "before. Make room on the disk, or take another `map_path`.",
     # Joining
     "no_depth": "No depth image is within `inputs.slop_s` of the RGB image. Check the rate and "
