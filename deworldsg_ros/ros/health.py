@@ -266,7 +266,6 @@ REASONS: dict[str, str] = {
     "other_session": "Two nodes publish a graph on the same topics, or a request names the session "
     "of a graph that is no more. End one of the two nodes, or give it a namespace; read the graph "
     "again.",
-    "before. Make room on the disk, or take another `map_path`.",
     # Joining
     "no_depth": "No depth image is within `inputs.slop_s` of the RGB image. Check the rate and "
     "the stamps of the depth images.",
