@@ -65,7 +65,10 @@ def _safetensors(path: Path) -> list[ParameterHeader]:
     try:
         with path.open("rb") as opened:
             length = int.from_bytes(opened.read(8), "little")
-            text = opened.read(length) if length < MAX_HEADER_BYTES else b""
+            left = max(path.stat().st_size - 8, 0)
+            if length > min(left, MAX_HEADER_BYTES):
+                raise ValueError(f"its header has {length} bytes, of which {left} are there")
+            text = opened.read(length)
         entries = parse_json(text, dict[str, Any])
         entries.pop("__metadata__", None)
         found = msgspec.convert(entries, dict[str, _Entry])

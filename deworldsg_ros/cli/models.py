@@ -156,10 +156,12 @@ def inspect_file(path: Path, console: Console) -> None:
     for file in paths:
         headers = read_headers(file)
         values = sum(_values(header) for header in headers)
-        console.print(f"{file.name}: {len(headers)} parameters, {values / 1e6:.2f} million values")
+        lines = [f"{file.name}: {len(headers)} parameters, {values / 1e6:.2f} million values"]
         for header in headers:
             shape = " x ".join(map(str, header.shape)) or "scalar"
-            console.print(f"  {visible(header.name)}  {header.dtype}  {shape}")
+            lines.append(f"  {header.name}  {header.dtype}  {shape}")
+        for line in lines:
+            console.print(visible(line), markup=False)
 
 
 # --- `deworldsg models measure`: detectors on a recording of the user.

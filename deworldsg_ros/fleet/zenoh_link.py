@@ -27,6 +27,13 @@ MAX_NAME = 64
 ROBOT_NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{MAX_NAME}}}")
 # Each one takes a thread while it is asked, and the fleet keeps its last graph.
 MAX_ROBOTS = 256
+# The largest answer of a robot, packed and as JSON: ten thousand objects with their relations take
+# half of it. Its objects take six times as much memory as the JSON.
+MAX_PACKED_BYTES, MAX_ANSWER_BYTES = 16 * 2**20, 64 * 2**20
+# Objects and relations of a robot's graph, however many answers it came in.
+MAX_PARTS = 200_000
+# A robot that has never answered keeps its place for so long, if another one needs it.
+PATIENCE_S = 10.0
 # A robot without a token and without an answer for so long is asked no more. If it comes back, its
 # whole graph is sent again: that should not happen after each gap of a radio link.
 GONE_S = 60.0
@@ -156,14 +163,33 @@ class Follower:
         for reply in self._session.get(f"{self._key}?{parameters}", timeout=timeout_s):
             if reply.ok is None:
                 continue
-            packed = reply.ok.payload.to_bytes()
-            self.received_bytes += len(packed)
-            answered = bool(packed) and replica.apply(_unpacked(packed)) or bool(answered)
+            size = len(reply.ok.payload)
+            self.received_bytes += size
+            if size > MAX_PACKED_BYTES:
+                raise RefusedInput(
+                    "message_too_large",
+                    f"an update has {size} bytes, packed: expected at most {MAX_PACKED_BYTES}",
+                )
+            with _UNPACKING:
+                packed = reply.ok.payload.to_bytes()
+                answered = bool(packed) and replica.apply(_unpacked(packed)) or bool(answered)
+            parts = len(replica.nodes) + len(replica.edges)
+            if parts > MAX_PARTS:
+                self.replica = GraphReplica()
+                raise RefusedInput(
+                    "message_too_large",
+                    f"a robot's graph has {parts} objects and relations: expected at most "
+                    f"{MAX_PARTS}",
+                )
         return answered
 
 
+# One answer at a time: the memory for it is taken once, however many robots there are.
+_UNPACKING = threading.Lock()
+
+
 def _unpacked(packed: bytes) -> wire.SceneGraphUpdateMessage:
-    limit = wire.max_bytes(wire.SceneGraphUpdateMessage)
+    limit = MAX_ANSWER_BYTES
     unpacker = zlib.decompressobj()
     try:
         content = unpacker.decompress(packed, limit)
@@ -185,8 +211,10 @@ def _unpacked(packed: bytes) -> wire.SceneGraphUpdateMessage:
 class Robots:
     """Follows the graphs of all robots that are on the network.
 
-    Names that are none are refused (``invalid_robot``), and so are new robots when `MAX_ROBOTS`
-    have answered since the start (``too_many_robots``).
+    Names that are none are refused (``invalid_robot``). When there are `MAX_ROBOTS`, a new one
+    takes the place of one that has never answered for `PATIENCE_S`, else of the one that has been
+    gone for longest; without such a place it is refused (``too_many_robots``). A robot that did not
+    answer is asked on, and nobody waits for it.
 
     Args:
         session: of Zenoh.
@@ -199,40 +227,57 @@ class Robots:
         self._session = session
         self.followers: dict[str, Follower] = {}
         self._errors: list[Exception] = []
-        self._answered: set[str] = set()
+        # When each robot was met, was there, and answered; and those that are asked now.
+        self._met_s: dict[str, float] = {}
         self._there_s: dict[str, float] = {}
+        self._answered_s: dict[str, float] = {}
+        self._asking: dict[str, _Asking] = {}
+        self._silent: set[str] = set()
+        self._forgotten: list[str] = []
         self._forgotten_bytes = 0
 
     @property
     def received_bytes(self) -> int:
         """Size of all answers."""
-        return self._forgotten_bytes + sum(of.received_bytes for of in self.followers.values())
+        followers = list(self.followers.values())  # the fleet's thread adds and forgets some
+        return self._forgotten_bytes + sum(of.received_bytes for of in followers)
 
     def ask(self, timeout_s: float) -> dict[str, bool | None]:
-        """Ask every robot once, all at the same time.
+        """Ask every robot once, all at the same time; wait for those that answered the last time.
 
         Returns:
-            By name: whether its graph changed; None = it did not answer.
+            By name: whether its graph changed; None = it did not answer, or not yet.
         """
         prefix = robot_key("")
         for reply in self._session.liveliness().get(prefix + "*", timeout=timeout_s):
             if reply.ok is not None:
                 self._meet(str(reply.ok.key_expr)[len(prefix) :])
         self._forget_gone()
+        for name, follower in self.followers.items():
+            if name not in self._asking:
+                self._asking[name] = _Asking(follower, timeout_s)
         answers: dict[str, bool | None] = dict.fromkeys(self.followers)
-        threads = [
-            threading.Thread(target=self._ask, args=(name, timeout_s, answers), daemon=True)
-            for name in self.followers
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        for name, changed in answers.items():
-            if changed is not None:
-                self._answered.add(name)
-                self._there_s[name] = time.monotonic()
+        for name, asking in list(self._asking.items()):
+            asking.join(None if name in self.followers and name not in self._silent else 0.0)
+            if asking.is_alive():
+                continue
+            del self._asking[name]
+            if asking.error is not None:
+                self._errors.append(asking.error)
+            if name not in self.followers:
+                continue
+            answers[name] = asking.changed
+            if asking.changed is None:
+                self._silent.add(name)
+            else:
+                self._silent.discard(name)
+                self._there_s[name] = self._answered_s[name] = time.monotonic()
         return answers
+
+    def take_forgotten(self) -> list[str]:
+        """Robots since the last call that gave their place to others; their graphs go, too."""
+        forgotten, self._forgotten = self._forgotten, []
+        return forgotten
 
     def take_errors(self) -> list[Exception]:
         """Refusals and errors since the last call."""
@@ -251,26 +296,59 @@ class Robots:
                     "digits, _ and -",
                 )
             )
-        elif len({name, *self._answered, *self.followers}) > MAX_ROBOTS:
+        elif name not in self._answered_s and not self._make_place():
             self._errors.append(
                 RefusedInput(
                     "too_many_robots",
-                    f"robot '{name}' is ignored: expected at most {MAX_ROBOTS} since the start",
+                    f"robot '{name}' is ignored: expected at most {MAX_ROBOTS}",
                 )
             )
         else:
             self.followers[name] = Follower(self._session, robot_key(name))
-            self._there_s[name] = time.monotonic()
+            self._met_s[name] = self._there_s[name] = time.monotonic()
+
+    def _make_place(self) -> bool:
+        """Whether there is a place for one more robot, also after one was forgotten."""
+        known = {**self._answered_s, **self.followers}
+        if len(known) < MAX_ROBOTS:
+            return True
+        now_s = time.monotonic()
+        for name in self.followers:  # the one that was met first
+            if name not in self._answered_s and now_s - self._met_s[name] > PATIENCE_S:
+                self._forget(name)
+                return True
+        gone = [name for name in self._answered_s if name not in self.followers]
+        if gone:
+            name = min(gone, key=self._answered_s.__getitem__)
+            del self._answered_s[name]
+            self._forgotten.append(name)
+        return bool(gone)
 
     def _forget_gone(self) -> None:
         """Each robot that is asked takes a thread, also one that never answers."""
         now_s = time.monotonic()
         for name in [name for name, at_s in self._there_s.items() if now_s - at_s > GONE_S]:
-            del self._there_s[name]
-            self._forgotten_bytes += self.followers.pop(name).received_bytes
+            self._forget(name)
 
-    def _ask(self, name: str, timeout_s: float, answers: dict[str, bool | None]) -> None:
+    def _forget(self, name: str) -> None:
+        del self._there_s[name], self._met_s[name]
+        self._silent.discard(name)
+        self._forgotten_bytes += self.followers.pop(name).received_bytes
+
+
+class _Asking(threading.Thread):
+    """Asks one robot; `changed` is as the answer of `Follower.ask`."""
+
+    def __init__(self, follower: Follower, timeout_s: float) -> None:
+        super().__init__(daemon=True)
+        self.changed: bool | None = None
+        self.error: Exception | None = None
+        self._follower, self._timeout_s = follower, timeout_s
+        self.start()
+
+    def run(self) -> None:
+        """Ask; one robot must not stop the others."""
         try:
-            answers[name] = self.followers[name].ask(timeout_s)
-        except Exception as error:  # one robot must not stop the others
-            self._errors.append(error)
+            self.changed = self._follower.ask(self._timeout_s)
+        except Exception as error:
+            self.error = error

@@ -53,12 +53,12 @@ class FleetNode(StageNode):
         now_s = time.monotonic()
         missing = [
             f"{name} has not answered for {now_s - last_s:.0f} s"
-            for name, last_s in sorted(self._answered_s.items())
+            for name, last_s in sorted(self._answered_s.copy().items())
             if now_s - last_s > SILENCE_S
         ]
         missing += [
             f"{name} is not located: {member.reason}"
-            for name, member in sorted(self._fleet.members.items())
+            for name, member in sorted(self._fleet.members.copy().items())
             if member.T_fleet_world is None
         ]
         return missing or ([] if self._answered_s else ["no robot: start fleet_link_node on each"])
@@ -68,7 +68,7 @@ class FleetNode(StageNode):
         return {
             "robots": str(len(self._answered_s)),
             "bytes received": str(self._robots.received_bytes),
-            "bytes sent": str(sum(feed.sent_bytes for feed in self._feeds.values())),
+            "bytes sent": str(sum(feed.sent_bytes for feed in list(self._feeds.values()))),
         }
 
     def _step(self) -> None:
@@ -76,6 +76,12 @@ class FleetNode(StageNode):
         for error in self._robots.take_errors():
             with self.refusing():
                 raise error
+        for name in self._robots.take_forgotten():
+            self._answered_s.pop(name, None)
+            self._fleet.members.pop(name, None)
+            self._parts.pop(name, None)
+            if name in self._feeds:
+                self._feeds.pop(name).close()
         for name, changed in answers.items():
             if changed is not None:
                 self._answered_s[name] = time.monotonic()

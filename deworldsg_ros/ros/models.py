@@ -253,7 +253,8 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
 
     def more_values(self) -> dict[str, str]:
         """Frames that were turned upright for the detector, by angle."""
-        turned = {f"{TURNED}{90 * n} degrees": str(k) for n, k in self._turns.items() if n}
+        turns = self._turns.copy()  # the thread of the frames adds to them
+        turned = {f"{TURNED}{90 * n} degrees": str(k) for n, k in turns.items() if n}
         return {**super().more_values(), **turned}
 
 

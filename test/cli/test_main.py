@@ -1,5 +1,6 @@
 """Options, refusals, and the commands that look at recordings and configurations."""
 
+import json
 import re
 from pathlib import Path
 
@@ -132,3 +133,19 @@ def test_settings_have_the_type_of_their_field(setting, value):
     section, _, field = setting.partition("=")[0].partition(".")
     found = getattr(getattr(effective_config(None, [setting]), section), field)
     assert (found, type(found)) == (value, type(value))
+
+
+def test_what_a_file_of_weights_says_cannot_write_on_the_terminal(tmp_path):
+    entries = {"a[red]\x1b[2J": {"dtype": "F32\x1b[31m\nfine", "shape": [2, 3]}}
+    header = json.dumps(entries).encode()
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(len(header).to_bytes(8, "little") + header)
+    shown = printed("models", "inspect", path)
+    assert "\x1b" not in shown and "a[red]" in shown and len(shown.splitlines()) == 2
+
+
+@pytest.mark.parametrize("claimed", [3, 99_999_999, 2**64 - 1])
+def test_a_header_that_is_not_there_is_refused(tmp_path, claimed):
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(claimed.to_bytes(8, "little") + b"{}")
+    assert "of which 2 are there" in refusal("models", "inspect", path)

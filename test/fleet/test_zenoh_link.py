@@ -1,5 +1,7 @@
 """Feeds and followers over a real Zenoh router; which robots are asked, over an imitated one."""
 
+import sys
+import threading
 import time
 import zlib
 from types import SimpleNamespace as Value
@@ -9,7 +11,15 @@ import pytest
 from support.view import make_graph, make_node
 
 from deworldsg_ros.fleet import zenoh_link
-from deworldsg_ros.fleet.zenoh_link import GONE_S, Feed, Follower, Robots, open_session, robot_key
+from deworldsg_ros.fleet.zenoh_link import (
+    GONE_S,
+    PATIENCE_S,
+    Feed,
+    Follower,
+    Robots,
+    open_session,
+    robot_key,
+)
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import ChangeLog
@@ -78,10 +88,12 @@ def test_a_follower_has_the_graph_also_after_the_router_was_away(endpoint, opene
         (zlib.compress(b"[" * 1000), "invalid_message"),
         (zlib.compress(b" " * 2_000_000), "message_too_large"),
         (zlib.compress(b"x" * 100)[:-5], "message_too_large"),
+        (bytes(200_000), "message_too_large"),
     ],
 )
 def test_hostile_answers_are_refused_and_change_nothing(opened, answer, reason, monkeypatch):
-    monkeypatch.setattr(wire, "MAX_GRAPH_BYTES", 1_000_000)
+    monkeypatch.setattr(zenoh_link, "MAX_ANSWER_BYTES", 1_000_000)
+    monkeypatch.setattr(zenoh_link, "MAX_PACKED_BYTES", 100_000)
     opened().declare_queryable("k", lambda query: query.reply(query.key_expr, answer))
     follower = Follower(opened(), "k")
     with pytest.raises(RefusedInput) as refused:
@@ -106,6 +118,13 @@ def test_endpoints_that_cannot_be_used_are_refused_in_one_line(endpoint, opened)
             opened(connect, listen)
 
 
+class Payload(bytes):
+    """The bytes of a reply."""
+
+    def to_bytes(self):
+        return bytes(self)
+
+
 class Network:
     """A Zenoh session: who is there, the logs of those that answer, and who was asked."""
 
@@ -125,7 +144,7 @@ class Network:
         if isinstance(log, Exception):
             raise log
         packed = zlib.compress(wire.encode(log.since(None, 0)).encode())
-        return [Value(ok=Value(payload=Value(to_bytes=lambda: packed)))]
+        return [Value(ok=Value(payload=Payload(packed)))]
 
 
 @pytest.fixture
@@ -176,17 +195,79 @@ def test_robots_that_are_gone_are_forgotten(network, robots, clock):
     assert robots.ask(1.0) == {"ada": None, "bob": True}  # its whole graph again
 
 
-def test_the_number_of_robots_is_bounded(network, robots, clock, monkeypatch):
+def test_ever_new_names_take_the_places_of_those_that_are_gone(network, robots, clock, monkeypatch):
     monkeypatch.setattr(zenoh_link, "MAX_ROBOTS", 3)
-    network.tokens = ["silent"]
-    robots.ask(1.0)
-    for number in range(5):  # ever new names, one at a time
+    for number in range(5):  # one at a time
         clock.now_s += GONE_S + 1.0
         network.tokens, network.logs = [f"robot{number}"], {f"robot{number}": log_of(1, "cup")}
-        robots.ask(1.0)
-    assert errors(robots) == ["too_many_robots"] * 2
-    network.tokens, network.logs = ["robot0"], {"robot0": log_of(1, "cup")}
-    assert robots.ask(1.0) == {"robot0": True}  # one that is known may come back
+        assert robots.ask(1.0) == {f"robot{number}": True}
+    assert errors(robots) == [] and robots.take_forgotten() == ["robot0", "robot1"]
+    # Those that are there keep their places.
+    network.tokens = names = ["robot2", "robot3", "robot4", "late"]
+    network.logs = {name: log_of(1, "cup") for name in names}
+    assert set(robots.ask(1.0)) == {"robot2", "robot3", "robot4"}
+    assert errors(robots) == ["too_many_robots"] and robots.take_forgotten() == []
+
+
+def test_names_that_never_answer_do_not_lock_out_a_robot(network, robots, clock, monkeypatch):
+    monkeypatch.setattr(zenoh_link, "MAX_ROBOTS", 4)
+    network.tokens = ["ada", "x1", "x2", "x3", "bob"]
+    network.logs = {"ada": log_of(1, "cup"), "bob": log_of(1, "pot")}
+    robots.ask(1.0)
+    assert "bob" not in robots.followers and errors(robots) == ["too_many_robots"]
+    clock.now_s += PATIENCE_S + 1.0
+    assert {"ada", "bob"} <= {name for name, new in robots.ask(1.0).items() if new is not None}
+
+
+def test_nobody_waits_for_a_robot_that_does_not_answer(network, robots):
+    network.tokens, network.logs = ["ada", "mute"], {"ada": log_of(1, "cup")}
+    answer, waits = network.get, threading.Event()
+
+    def get(selector, timeout):
+        if "mute" in selector and robots._silent:
+            waits.wait(LIMIT_S)
+        return answer(selector, timeout)
+
+    network.get = get
+    assert robots.ask(1.0) == {"ada": True, "mute": None}
+    for _ in range(3):
+        started_s = time.monotonic()
+        assert robots.ask(1.0)["mute"] is None
+        assert time.monotonic() - started_s < 0.5 * LIMIT_S
+    network.logs["mute"] = log_of(1, "pot")
+    waits.set()
+    until(lambda: robots.ask(1.0)["mute"])
+
+
+def test_a_graph_that_grows_without_end_is_dropped(network, robots, monkeypatch):
+    monkeypatch.setattr(zenoh_link, "MAX_PARTS", 2)
+    network.tokens, network.logs = ["ada"], {"ada": log_of(1, "cup", "pot", "pan")}
+    assert robots.ask(1.0) == {"ada": None}
+    assert errors(robots) == ["message_too_large"]
+    assert not robots.followers["ada"].replica.nodes
+
+
+def test_counts_may_be_read_while_robots_come_and_go(robots):
+    """Without a copy, a dictionary that changes meanwhile is an error within milliseconds."""
+    stop = threading.Event()
+
+    def change():
+        while not stop.is_set():
+            for name in "abcdefgh":
+                robots.followers[name] = Follower(None, name)
+            robots.followers.clear()
+
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    thread = threading.Thread(target=change)
+    thread.start()
+    try:
+        for _ in range(20_000):
+            assert robots.received_bytes == 0
+    finally:
+        stop.set()
+        thread.join()
+        sys.setswitchinterval(interval_s)
 
 
 def test_a_robot_that_fails_does_not_stop_the_others(network, robots):

@@ -6,6 +6,7 @@ import ipaddress
 import logging
 import secrets
 import socket
+import zlib
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -55,37 +56,63 @@ class LogOnce:
 
 # A moment is found by applying at most so many updates to a snapshot.
 BLOCK = 100
-# The oldest updates are forgotten beyond this number: ten minutes at 30 Hz.
-MOST_UPDATES = 18_000
+# The oldest moments are forgotten beyond so many bytes, packed: minutes of a busy room at 30 Hz,
+# hours of a quiet one.
+MOST_BYTES = 64_000_000
+# So large a part of them begins a new block, whose moments are forgotten together.
+BLOCK_PART = 16
 
 
-@dataclass
 class _Block:
-    """A snapshot, the first moment of the block, and the updates after it."""
+    """A snapshot, the first moment of the block, and the updates after it; JSON, packed."""
 
-    start: wire.SceneGraphMessage
-    updates: list[wire.SceneGraphUpdateMessage] = field(default_factory=list)
+    def __init__(self, start: wire.SceneGraphMessage) -> None:
+        self._start, self._updates = _packed(start), list[bytes]()
+        self.size_bytes = len(self._start)
 
     def __len__(self) -> int:
-        return 1 + len(self.updates)
+        return 1 + len(self._updates)
+
+    def add(self, update: wire.SceneGraphUpdateMessage) -> None:
+        """Add the next moment."""
+        packed = _packed(update)
+        self._updates.append(packed)
+        self.size_bytes += len(packed)
+
+    def at(self, moment: int) -> GraphReplica:
+        """The graph at a moment of the block."""
+        replica = GraphReplica()
+        replica.reset(wire.decode(zlib.decompress(self._start), wire.SceneGraphMessage))
+        for packed in self._updates[:moment]:
+            replica.apply(wire.decode(zlib.decompress(packed), wire.SceneGraphUpdateMessage))
+        return replica
+
+
+def _packed(message: wire.Message) -> bytes:
+    return zlib.compress(wire.encode(message).encode(), 1)
 
 
 class History:
     """The graph after each update. Moments are numbered from 0; the oldest are forgotten.
 
     Args:
-        most_updates: number of moments that are kept, about.
+        most_bytes: that the moments take, about.
 
     Attributes:
         newest: the graph now.
         first: number of the oldest moment that is kept.
     """
 
-    def __init__(self, most_updates: int = MOST_UPDATES) -> None:
+    def __init__(self, most_bytes: int = MOST_BYTES) -> None:
         self.newest = GraphReplica()
         self.first = 0
-        self._most_blocks = max(most_updates // BLOCK, 1)
+        self._most_bytes = most_bytes
         self._blocks: list[_Block] = []
+
+    @property
+    def size_bytes(self) -> int:
+        """That the moments take."""
+        return sum(block.size_bytes for block in self._blocks)
 
     @property
     def session(self) -> str | None:
@@ -116,28 +143,31 @@ class History:
         if not self.newest.apply(update):
             return False
         # The first update of a session replaces the graph, so it begins a block too.
-        if not self._blocks or update.sequence == 1 or len(self._blocks[-1]) >= BLOCK:
+        if not self._blocks or update.sequence == 1 or self._is_full(self._blocks[-1]):
             self._begin(self.newest.message())
         else:
-            self._blocks[-1].updates.append(update)
+            self._blocks[-1].add(update)
+            self._forget()
         return True
 
     def at(self, moment: int) -> GraphReplica:
         """The graph at a moment; the nearest one that is kept."""
         left = min(max(moment, self.first), self.last) - self.first
-        replica = GraphReplica()
         for block in self._blocks:
             if left < len(block):
-                replica.reset(block.start)
-                for update in block.updates[:left]:
-                    replica.apply(update)
-                break
+                return block.at(left)
             left -= len(block)
-        return replica
+        return GraphReplica()
+
+    def _is_full(self, block: _Block) -> bool:
+        return len(block) >= BLOCK or block.size_bytes * BLOCK_PART >= self._most_bytes
 
     def _begin(self, snapshot: wire.SceneGraphMessage) -> None:
         self._blocks.append(_Block(snapshot))
-        if len(self._blocks) > self._most_blocks:
+        self._forget()
+
+    def _forget(self) -> None:
+        while len(self._blocks) > 1 and self.size_bytes > self._most_bytes:
             self.first += len(self._blocks.pop(0))
 
 
