@@ -134,7 +134,7 @@ def write_atomically(path: Path, content: Content, *, previous: Path | None = No
         OSError: if the file cannot be written, or the path is no regular file. Errors of `content`
             pass through.
     """
-    _check_regular(path)
+    check_regular(path)
     path = Path(os.path.realpath(path))
     remove_left_overs(path.parent)
     partial, descriptor = _new(path.parent, _make_file)
@@ -198,7 +198,7 @@ def together(folder: Path, names: Iterable[str]) -> Iterator[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     folder, names = Path(os.path.realpath(folder)), set(names)
     for name in names:
-        _check_regular(folder / name)
+        check_regular(folder / name)
     with temporary_folder(folder) as staged:
         yield staged
         for path in staged.iterdir():
@@ -281,7 +281,7 @@ def check_writable(path: Path) -> None:
     Raises:
         OSError: if it cannot.
     """
-    _check_regular(path)
+    check_regular(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with temporary_folder(Path(os.path.realpath(path)).parent):
         pass
@@ -457,7 +457,7 @@ def _is_own(descriptor: int) -> bool:
     return private and status.st_uid == os.geteuid()
 
 
-def _check_regular(path: Path) -> None:
+def check_regular(path: Path) -> None:
     """Raise OSError for a path that is there and no regular file; a pipe would block."""
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "is a folder: expected a file", path)

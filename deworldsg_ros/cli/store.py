@@ -139,7 +139,7 @@ def _parameter(text: str) -> tuple[str, Any]:
         raise StoreError(f"'{text[:80]}': expected NAME=VALUE")
     try:
         return name, json.loads(value)
-    except ValueError:
+    except (ValueError, RecursionError):
         return name, value
 
 

@@ -320,7 +320,8 @@ REASONS: dict[str, str] = {
     "keys of `deworldsg/robots` on the Zenoh network.",
     "too_many_robots": "256 robots are in the fleet, and a new one is ignored. Look for a robot "
     "that has several names at once.",
-    "message_too_large": "A JSON message is larger than 16 MiB, or 256 MiB for the global graph, or 64 MiB for that of a robot of a fleet. "
+    "message_too_large": "A JSON message is larger than 16 MiB, or 256 MiB for the global graph, "
+    "or 64 MiB for that of a robot of a fleet. "
     "Look for a second publisher on its topic.",
     "invalid_stamp": "The stamp of a message is negative. Check the clock of its publisher.",
     "unknown_schema": "A JSON message has another schema, or a later version of it. Run all nodes "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -14,6 +15,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from deworldsg_ros.base.files import check_regular
 from deworldsg_ros.client.boxes import box_of
 from deworldsg_ros.client.changes import MOVED_M, MOVED_PART
 from deworldsg_ros.client.objects import Point
@@ -177,8 +179,8 @@ def _refusal(problem: str) -> StoreError:
 VERSION = 1
 # The database uses less memory if the graph is small.
 BUFFER_BYTES = 1 << 30
-# A question that takes longer is ended.
-QUESTION_LIMIT_MS = 60_000
+# A question that takes longer is ended, and so is one with more rows.
+QUESTION_LIMIT_S, MOST_ROWS = 60.0, 100_000
 # More rows are loaded at once. That also joins the log with the database: a third of a second.
 MANY_ROWS = 1000
 # A writer has the database for some milliseconds every other second, and for seconds to rebuild it.
@@ -240,6 +242,19 @@ class Rows:
     rows: list[list[Any]]
 
 
+# Of ladybug: C++ exceptions, also those of a damaged file.
+_ERRORS = (RuntimeError, ValueError, TypeError, OverflowError, MemoryError, IndexError)
+
+
+@contextmanager
+def _of_ladybug() -> Iterator[None]:
+    """All errors of ladybug as RuntimeError."""
+    try:
+        yield
+    except _ERRORS as error:
+        raise RuntimeError(str(error).strip() or repr(error)) from error
+
+
 class Database:
     """An open database; use it within `opened`."""
 
@@ -248,9 +263,43 @@ class Database:
 
     def run(self, cypher: str, parameters: Mapping[str, Any] | None = None) -> Rows:
         """Run a statement; raises RuntimeError of ladybug."""
-        result = self._connection.execute(cypher, dict(parameters or {}))
-        with closing(result):
-            return Rows(result.get_column_names(), result.get_all())
+        with _of_ladybug():
+            result = self._connection.execute(cypher, dict(parameters or {}))
+            with closing(result):
+                return Rows(result.get_column_names(), result.get_all())
+
+    def answer(self, question: str, parameters: Mapping[str, Any] | None = None) -> Rows:
+        """Answer a question within `QUESTION_LIMIT_S` and `MOST_ROWS`.
+
+        Raises:
+            StoreError: if it takes more, or cannot be answered.
+        """
+        end_s = time.monotonic() + QUESTION_LIMIT_S
+        too_long = f"the question cannot be answered: it takes more than {QUESTION_LIMIT_S:g} s"
+        # Ladybug's own limit is not looked at in all of its operators.
+        timer = threading.Timer(QUESTION_LIMIT_S, self._connection.interrupt)
+        timer.start()
+        try:
+            result = self._connection.execute(question, dict(parameters or {}))
+            with closing(result):
+                if result.get_num_tuples() > MOST_ROWS:
+                    raise StoreError(
+                        "the question cannot be answered: it has "
+                        f"{result.get_num_tuples()} rows; expected at most {MOST_ROWS}, as with "
+                        "LIMIT"
+                    )
+                rows = []
+                while result.has_next():
+                    if time.monotonic() > end_s:
+                        raise StoreError(too_long)
+                    rows.append(result.get_next())
+                return Rows(result.get_column_names(), rows)
+        except _ERRORS as error:
+            if time.monotonic() > end_s:
+                raise StoreError(too_long) from error
+            raise _refusal((str(error).strip() or repr(error)).splitlines()[0]) from error
+        finally:
+            timer.cancel()
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
@@ -399,6 +448,7 @@ def opened(path: Path, *, read_only: bool) -> Iterator[Database]:
 
     Raises:
         StoreError: the extra is not installed, or another process does not end its work in time.
+        OSError: for a file that is none, such as a pipe.
         RuntimeError: of ladybug, e.g. if the database is damaged; also if a writer was killed.
     """
     try:
@@ -407,6 +457,7 @@ def opened(path: Path, *, read_only: bool) -> Iterator[Database]:
         raise StoreError(
             "the store needs the package ladybug: pip install 'deworldsg_ros[store]'"
         ) from error
+    check_regular(path)
     with _access(path.with_suffix(".lock"), fcntl.LOCK_SH if read_only else fcntl.LOCK_EX):
         # After a kill, ladybug can restore a part of a transaction only.
         being_written = path.with_name(f"{path.name}.writing")
@@ -414,11 +465,11 @@ def opened(path: Path, *, read_only: bool) -> Iterator[Database]:
             raise RuntimeError("a writer was killed")
         if not read_only:
             being_written.touch()
-        database = ladybug.Database(path, buffer_pool_size=BUFFER_BYTES, read_only=read_only)
-        with closing(database), closing(ladybug.Connection(database)) as connection:
-            if read_only:
-                connection.set_query_timeout(QUESTION_LIMIT_MS)
-            else:
+        with _of_ladybug():
+            database = ladybug.Database(path, buffer_pool_size=BUFFER_BYTES, read_only=read_only)
+            connected = ladybug.Connection(database)
+        with closing(database), closing(connected) as connection:
+            if not read_only:
                 # Changes stay in the log beside the database until there are many: joining them
                 # takes a third of a second.
                 connection.execute("CALL force_checkpoint_on_close=false")
@@ -478,6 +529,7 @@ def _dicts(
 @contextmanager
 def _access(path: Path, kind: int) -> Iterator[None]:
     """Hold a lock beside the database; ladybug's own lets a reader open it beside a writer."""
+    check_regular(path)
     with path.open("ab") as file:
         end_s = time.monotonic() + WAIT_S
         while True:

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from deworldsg_ros.base.files import FileLock, paused_collector
+from deworldsg_ros.base.files import FileLock, check_regular, paused_collector
 from deworldsg_ros.base.words import stamp_ns_from_text
 from deworldsg_ros.client.meanings import is_class
 from deworldsg_ros.graph.graph_files import MAX_GRAPH_BYTES, read_content
@@ -54,6 +54,7 @@ class Journal:
     """
 
     def __init__(self, path: Path) -> None:
+        check_regular(path)
         self._file = path.open("ab")
         self._file.truncate(_end_of_lines(path))
 
@@ -328,7 +329,8 @@ class Store:
                         raise StoreError(f"{self._path} cannot be read: {error}") from error
                     is_complete = False
                 if attempt or is_complete:
-                    yield database
+                    with _of_database(self._path, "read"):
+                        yield database
                     return
             # If a writer is at work, the database is a moment old.
             with suppress(BlockingIOError), StoreWriter(self._path.parent):
@@ -346,11 +348,7 @@ class Store:
         """
         question = checked_question(cypher)
         with self.opened() as database:
-            try:
-                return database.run(question, parameters)
-            except RuntimeError as error:
-                problem = str(error).splitlines()[0]
-                raise StoreError(f"the question cannot be answered: {problem}") from error
+            return database.answer(question, parameters)
 
     def at(self, time_ns: int, label: str | None = None) -> list[Stay]:
         """Where objects were at a time, by label and id.
@@ -379,6 +377,19 @@ class Store:
     def _is_complete(self, database: Database) -> bool:
         head = database.head()
         return head is not None and head.position == self._messages.stat().st_size
+
+
+@contextmanager
+def _of_database(path: Path, done: str) -> Iterator[None]:
+    """Errors of the database, as of a full disk or a damaged file, in one sentence."""
+    try:
+        yield
+    except RuntimeError as error:
+        problem = (str(error).strip() or repr(error)).splitlines()[0]
+        raise StoreError(
+            f"{path} cannot be {done}: {problem}; {MESSAGES_FILE} has all messages: make room on "
+            f"the disk if it is full, then `deworldsg store rebuild {path.parent}`"
+        ) from error
 
 
 class StoreWriter:
@@ -439,7 +450,11 @@ class StoreWriter:
         if not self._batch:
             return
         self._journal.sync()
-        with paused_collector(), opened(self._path, read_only=False) as database:
+        with (
+            _of_database(self._path, "written"),
+            paused_collector(),
+            opened(self._path, read_only=False) as database,
+        ):
             self._write(database)
 
     def rebuild(self) -> None:
@@ -466,7 +481,10 @@ class StoreWriter:
             pass  # it is damaged, or of another version of ladybug
         for path in self._path.parent.glob(f"{self._path.name}*"):
             path.unlink()
-        with opened(self._path, read_only=False) as database:
+        with (
+            _of_database(self._path, "written"),
+            opened(self._path, read_only=False) as database,
+        ):
             with database.transaction():
                 database.make_tables()
             self._continue(database)

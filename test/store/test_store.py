@@ -12,12 +12,13 @@ from pathlib import Path
 import msgspec
 import pytest
 from support.cli import printed, refusal
+from support.killing import full_disk
 from support.view import box_at, make_edge, make_graph, make_node, random_graphs, updates_of
 
 from deworldsg_ros.cli.store import add_joined
 from deworldsg_ros.client.changes import MOVED_M
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.store import Store, StoreError
+from deworldsg_ros.store import Store, StoreError, database
 from deworldsg_ros.store.store import DATABASE_FILE, MESSAGES_FILE, StoreWriter, time_ns_from_text
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import GraphReplica, join
@@ -275,6 +276,80 @@ def test_a_line_that_was_cut_off_is_dropped_and_a_damaged_one_is_named(tmp_path)
     messages.write_bytes(b"".join(lines))
     with pytest.raises(StoreError, match=f"byte {len(lines[0])}"):
         StoreWriter(tmp_path).rebuild()
+
+
+@pytest.mark.parametrize(
+    ("cypher", "parameters"),
+    [
+        ("RETURN $a", {"a": 10**30}),
+        ("RETURN $a", {"a": object()}),
+        ("RETURN $a", {"a": [[1], "x", {"y": []}]}),
+        ("RETURN $a", {}),
+        ("RETURN $b", {"a": 1}),
+        ("MATCH (o:Object) WHERE o.id = $a RETURN o.label", {"a": "cup"}),
+        ("MATCH (o:Nothing) RETURN o", {}),
+    ],
+)
+def test_a_question_is_answered_or_refused_in_one_line(tmp_path, cypher, parameters):
+    store = written(tmp_path, graph(1, 1.0, [node(1)]))
+    try:
+        assert store.ask(cypher, parameters).columns
+    except StoreError as error:
+        assert "cannot be answered" in str(error) and "\n" not in str(error)
+
+
+def test_a_question_has_bounds(tmp_path, monkeypatch):
+    store = written(tmp_path, graph(1, 1.0, [node(1)]))
+    assert len(store.ask("UNWIND range(1, 1000) AS x RETURN x").rows) == 1000
+    with pytest.raises(StoreError, match="it has 20000000 rows; expected at most"):
+        store.ask("UNWIND range(1, 20000000) AS x RETURN x")
+    monkeypatch.setattr(database, "QUESTION_LIMIT_S", 0.3)
+    many = " ".join(f"UNWIND range(1, 3000) AS x{i}" for i in range(4))
+    started_s = time.monotonic()
+    with pytest.raises(StoreError, match=r"more than 0\.3 s"):
+        store.ask(f"{many} RETURN sum(x0 * x1 + x2 * x3)")
+    assert time.monotonic() - started_s < 20.0
+
+
+@pytest.mark.parametrize("name", [MESSAGES_FILE, DATABASE_FILE, "graph.lock"])
+def test_a_pipe_in_place_of_a_file_is_refused(tmp_path, name):
+    written(tmp_path, graph(1, 1.0, [node(1)]))
+    (tmp_path / name).unlink()
+    os.mkfifo(tmp_path / name)
+    message = tmp_path / "graph.json"
+    message.write_text(wire.encode(graph(2, 2.0, [node(1)])))
+    assert "pipe" in refusal("store", "add", tmp_path, message)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_flipped_database_gives_an_answer_or_one_line(tmp_path, seed):
+    messages = random_session(seed, 20)
+    written(tmp_path, *messages)
+    path = tmp_path / DATABASE_FILE
+    content = bytearray(path.read_bytes())
+    random_bytes = random.Random(seed)
+    for _ in range(200):
+        content[random_bytes.randrange(len(content))] ^= 1 << random_bytes.randrange(8)
+    path.write_bytes(content)
+    for words in (
+        ("ask", tmp_path, "MATCH (o:Object) RETURN o.id, o.label"),
+        ("at", tmp_path, "0"),
+    ):
+        code = f"from deworldsg_ros.cli.app import app; app({['store', *map(str, words)]})"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert "Traceback" not in done.stderr, done.stderr
+        # Ladybug itself may crash on a damaged file.
+        assert done.returncode in (0, 2, -signal.SIGSEGV, -signal.SIGABRT), done
+
+
+def test_a_full_disk_is_one_line_and_loses_no_message(tmp_path):
+    first = graph(1, 1.0, [node(1)])
+    store = written(tmp_path, first)
+    size_bytes = (tmp_path / DATABASE_FILE).stat().st_size
+    with full_disk(size_bytes // 2), pytest.raises((StoreError, OSError)):
+        written(tmp_path, graph(2, 2.0, [node(i) for i in range(1, 3000)]))
+    written(tmp_path, graph(3, 3.0, [node(1), node(2)]))
+    assert len(store.ask("MATCH (o:Object) RETURN o.id").rows) == 2
 
 
 def test_one_writer_at_a_time_and_readers_meanwhile(tmp_path):
