@@ -505,8 +505,8 @@ class GraphKeeper:
 
     def integrate(self, local: LocalGraph) -> None:
         """Merge a local graph; one whose stamp jumps is held back until the next one."""
-        admitted, lost_ns = self._clock.admit(local.stamp_ns, local)
-        if lost_ns is not None:
+        admitted, lost = self._clock.admit(local.stamp_ns, local)
+        for lost_ns in lost:
             self._node.drop("time_jump", jump_text("local graph", lost_ns))
         for _, item in admitted:
             with self._node.refusing():

@@ -359,8 +359,8 @@ class Assembler(ABC, Generic[T, Out]):
     def _add(self, stream: Stream[Any], stamp_ns: int, value: Any) -> None:
         """Take an item; it is held back if its stamp jumps."""
         stream.heard()
-        admitted, lost_ns = stream.gate.admit(stamp_ns, value)
-        if lost_ns is not None:
+        admitted, lost = stream.gate.admit(stamp_ns, value)
+        for lost_ns in lost:
             self._drop("time_jump", jump_text(stream.name, lost_ns, stream.gate.max_step_ns))
         for at_ns, item in admitted:
             self._take(stream, at_ns, item)

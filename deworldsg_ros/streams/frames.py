@@ -234,7 +234,8 @@ class UnposedAssembler(PosedAssembler[Any, UnposedFrame]):
         super().__init__("rgb", (), inputs, topics, capacity, max_wait_s, on_drop)
         self._streams.remove(self._pose)
         for stream in self._streams:
-            stream.gate = ClockGate(MAX_GAP_NS)
+            # A jump begins odometry anew, so it has to be sure.
+            stream.gate = ClockGate(MAX_GAP_NS, confirmed_by=3)
 
     def add_rgb(self, message: Any, stamp_ns: int) -> None:
         """Keep an RGB image, Image or CompressedImage."""

@@ -148,47 +148,51 @@ MAX_STEP_NS = 60 * 10**9
 
 
 class ClockGate(Generic[T]):
-    """Holds back a message whose stamp jumps, until the next one confirms the jump.
+    """Holds back a message whose stamp jumps, until later ones confirm the jump.
 
     A stamp jumps if it is more than `max_step_ns` after the newest one, or more than `RESTART_NS`
-    before it. The next message confirms the jump if its stamp is later and jumps in the same
-    direction. Otherwise the first one had a wrong stamp, and is lost.
+    before it. A message confirms the jump if its stamp follows that of the held one, and jumps in
+    the same direction. Otherwise the held ones had wrong stamps, and are lost.
 
     Args:
         max_step_ns: as above.
+        confirmed_by: number of messages that confirm a jump.
 
     Attributes:
         newest_ns: stamp of the newest message that passed; None before the first.
     """
 
-    def __init__(self, max_step_ns: int = MAX_STEP_NS) -> None:
+    def __init__(self, max_step_ns: int = MAX_STEP_NS, confirmed_by: int = 1) -> None:
         self.max_step_ns = max_step_ns
         self.newest_ns: int | None = None
-        self._held: tuple[int, T] | None = None
+        self._confirmed_by = confirmed_by
+        self._held: list[tuple[int, T]] = []
 
-    def admit(self, stamp_ns: int, value: T) -> tuple[list[tuple[int, T]], int | None]:
+    def admit(self, stamp_ns: int, value: T) -> tuple[list[tuple[int, T]], list[int]]:
         """Add a message.
 
         Returns:
-            stamps and values of the messages to take now, in order; and the stamp of a message
-            that is lost, or None.
+            stamps and values of the messages to take now, in order; and the stamps of those that
+            are lost.
         """
-        held, self._held = self._held, None
-        lost_ns = None if held is None else held[0]
+        held, self._held = self._held, []
         side = self._side(stamp_ns)
         if side == 0:
             self.newest_ns = max(stamp_ns, self.newest_ns or 0)
-            return [(stamp_ns, value)], lost_ns
-        if held is not None and stamp_ns > held[0] and self._side(held[0]) == side:
-            self.newest_ns = stamp_ns
-            return [held, (stamp_ns, value)], None
-        self._held = (stamp_ns, value)
-        return [], lost_ns
+            return [(stamp_ns, value)], [lost for lost, _ in held]
+        if held and (stamp_ns <= held[-1][0] or self._side(held[-1][0]) != side):
+            self._held = [(stamp_ns, value)]
+            return [], [lost for lost, _ in held]
+        self._held = [*held, (stamp_ns, value)]
+        if len(self._held) <= self._confirmed_by:
+            return [], []
+        self.newest_ns = stamp_ns
+        return self.release(), []
 
     def release(self) -> list[tuple[int, T]]:
-        """The message that is held back: no other will follow."""
-        held, self._held = self._held, None
-        return [] if held is None else [held]
+        """The messages that are held back: no other will follow."""
+        held, self._held = self._held, []
+        return held
 
     def _side(self, stamp_ns: int) -> int:
         """1 or -1 for a jump forward or back, 0 for none."""
@@ -273,8 +277,7 @@ class TransformTree:
             if static:
                 self._static[child] = T_parent_child
             else:
-                lost_ns = self._add_moving(child, stamp_ns_of(transform), T_parent_child)
-                if lost_ns is not None:
+                for lost_ns in self._add_moving(child, stamp_ns_of(transform), T_parent_child):
                     text = jump_text(f"transform of '{child}'", lost_ns)
                     refused.append(RefusedInput("time_jump", text))
             # Last: a reader in another thread then finds the transform of each frame in the tree.
@@ -282,15 +285,15 @@ class TransformTree:
         if refused:
             raise refused[0]
 
-    def _add_moving(self, child: str, stamp_ns: int, T_parent_child: Float64) -> int | None:
-        """Keep a transform; returns the stamp of one that is lost (`ClockGate`)."""
+    def _add_moving(self, child: str, stamp_ns: int, T_parent_child: Float64) -> list[int]:
+        """Keep a transform; returns the stamps of those that are lost (`ClockGate`)."""
         buffer = self._moving.setdefault(child, PoseBuffer(self._slop_ns))
         gate = self._gates.setdefault(child, ClockGate())
-        admitted, lost_ns = gate.admit(stamp_ns, T_parent_child)
+        admitted, lost = gate.admit(stamp_ns, T_parent_child)
         for at_ns, T in admitted:
             buffer.add(at_ns, T)
             self.newest_ns = max(self.newest_ns, at_ns)
-        return lost_ns
+        return lost
 
     def _has_room(self, child: str) -> bool:
         is_known = child in self._gates or child in self._static

@@ -105,9 +105,22 @@ def test_one_wrong_stamp_costs_a_frame_and_a_restarted_recording_restarts(odomet
     assert odometry.node.health.drops["time_jump"] == 2  # RGB and depth
     assert odometry.node.more_values()["odometry tracked"] == "5"
     odometry.stamp_ns -= 100 * 10**9
-    odometry.refuses("time_jump", lambda: [send(odometry, T) for T in path[:2]])
-    odometry.expect(lambda: len(poses) == 7, "two more poses")
+    odometry.refuses("time_jump", lambda: [send(odometry, T) for T in path[:5]])
+    odometry.expect(lambda: len(poses) == 9, "four more poses")
     np.testing.assert_allclose(pose_from_message(poses[5])[0], LEVEL, atol=1e-12)
+
+
+@pytest.mark.parametrize("wrong_s", [5, -5, 3600])
+@pytest.mark.parametrize("count", [2, 3])
+def test_some_wrong_stamps_in_a_row_do_not_begin_odometry_anew(odometry, wrong_s, count):
+    poses, path = collect(odometry), walk(8)
+    tracked(odometry, *path[:3])
+    for T in path[3 : 3 + count]:
+        send(odometry, T, wrong_ns=wrong_s * 10**9)
+    tracked(odometry, *path[3 + count :])
+    odometry.expect(lambda: len(poses) == 8 - count, "the poses")
+    assert_at(poses[-1], path, -1)
+    assert odometry.node.more_values()["odometry tracked"] == str(8 - count)
 
 
 def test_the_root_of_the_mounting_is_published_on_tf():

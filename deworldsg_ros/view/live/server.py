@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import logging
 import threading
 import time
 from collections import deque
@@ -15,6 +16,7 @@ import numpy as np
 import viser
 import websockets.asyncio.server as websocket_server
 
+from deworldsg_ros.base.words import visible
 from deworldsg_ros.graph.extent import horizontal_axes
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.view.live.camera import CameraView
@@ -236,6 +238,30 @@ class Viewer:
         self._fitted[client.client_id] = (position, bounds, aspect)
 
 
+class _OneLine(logging.Filter):
+    """What a connection ends with, in one line without a traceback, and once of each kind.
+
+    Whoever reaches the port can send what is no request and no frame of a page.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._known: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        error = record.exc_info[1] if record.exc_info else None
+        if error is None:
+            return True
+        kind = f"{record.getMessage()}: {type(error).__name__}"
+        record.msg, record.args = visible(f"live view: {kind}: {error}"), ()
+        record.exc_info = record.exc_text = None
+        is_new = kind not in self._known
+        self._known.add(kind)
+        return is_new
+
+
+_CONNECTIONS = logging.getLogger(f"{__name__}.connections")
+_CONNECTIONS.addFilter(_OneLine())
 _GUARDING = threading.Lock()
 
 
@@ -269,6 +295,7 @@ def _guarded(guard: Guard) -> Iterator[list[Guard]]:
             return response
 
         guarded.append(guard)
+        options["logger"] = _CONNECTIONS
         return serve(*arguments, process_request=process, **options)
 
     with _GUARDING:

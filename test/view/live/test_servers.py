@@ -162,6 +162,29 @@ def test_only_the_printed_address_opens_a_server_and_no_page_of_others(foxglove,
     assert path.strip("/") not in caplog.text
 
 
+def test_what_is_no_request_and_no_frame_is_one_line_in_the_log(caplog):
+    with closing(sources.open_sink(HERE, free_port(), "", foxglove=False)) as sink:
+        port, path = urlsplit(sink.url).port, urlsplit(sink.url).path
+        upgrade = (
+            f"GET {path} HTTP/1.1\r\nHost: {HERE}:{port}\r\nConnection: Upgrade\r\n"
+            "Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+            f"Sec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n"
+        ).encode()
+        for _ in range(3):
+            for frames in (b"", b"\xff" * 200, b"\x82\x85\0\0\0\0abcde"):
+                with socket.create_connection((HERE, port), LIMIT_S) as client:
+                    client.settimeout(2.0)
+                    client.sendall(upgrade + frames if frames else b"POST / HTTP/1.1\r\n\r\n")
+                    with contextlib.suppress(TimeoutError, ConnectionError):
+                        while client.recv(65536):
+                            pass
+    assert not [record for record in caplog.records if record.exc_info]
+    told = [r.getMessage() for r in caplog.records if r.name.endswith("connections")]
+    assert any("no" in line and "valid HTTP request" in line for line in told) or told
+    assert len(told) == len(set(told)) <= 4 and all("\n" not in line for line in told)
+
+
 def test_no_page_is_shown_that_is_not_guarded(monkeypatch):
     made = create_autospec(viser.ViserServer, instance=True)
     monkeypatch.setattr(viser, "ViserServer", lambda *_, **__: made)
