@@ -3,11 +3,14 @@
 import os
 import signal
 import struct
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-from support.nodes import ROOT, Camera, NodeProcess, Peer
+from support.browser import free_port
+from support.nodes import ROOT, TOPICS, Camera, NodeProcess, Peer
 
 from deworldsg_ros.cli.terminal import dds_environment
 from deworldsg_ros.recordings.recording import open_source
@@ -23,6 +26,20 @@ SILENCE_S = 1.0
 STAMP, STAMP_AT = struct.Struct("<iI"), 4
 
 
+# Follows the graph, asks it, and looks at each change.
+CLIENT = """
+import time
+from deworldsg_ros.client import SceneGraphClient
+from deworldsg_ros.client.questions import ask
+with SceneGraphClient() as client:
+    client.on_change(lambda graph, changes: changes.lines)
+    client.wait(1, 300)
+    while True:
+        ask(client.graph, "what is on the table")
+        time.sleep(0.5)
+"""
+
+
 class Rig:
     """The nodes and their camera; `folder` is for everything that the nodes write."""
 
@@ -31,6 +48,7 @@ class Rig:
         os.environ.update(dds_environment())
         self._folder, self.map_path = folder, folder / "room.map"
         self.processes: dict[str, NodeProcess] = {}
+        self.client: subprocess.Popen[bytes] | None = None
         self.peer = Peer("endurance")
         self.graph: wire.SceneGraphMessage | None = None  # the newest whole one
         self.updates = 0
@@ -54,6 +72,28 @@ class Rig:
         folder.mkdir(parents=True)
         parameters = {"map_path": f"'{self.map_path}'"}
         self.processes[name] = NodeProcess(name, folder, parameters=parameters)
+
+    def start_others(self) -> None:
+        """Start everything else that a user starts: one process for all stages, in a namespace of
+        its own, the viewer, the fleet with one robot, and a Python client."""
+        endpoint = f"'tcp/127.0.0.1:{free_port()}'"
+        own = [word for topic in TOPICS.values() for word in ("-r", f"{topic}:=/{topic}")]
+        others: dict[str, tuple[list[str], dict[str, object]]] = {
+            "deworldsg_node": (["-r", "__ns:=/single", *own], {}),
+            "viewer_node": ([], {"port": free_port()}),
+            "fleet_node": ([], {"listen": endpoint}),
+            "fleet_link_node": ([], {"connect": endpoint, "robot": "ada"}),
+        }
+        for name, (arguments, parameters) in others.items():
+            folder = self._folder / name
+            folder.mkdir()
+            self.processes[name] = NodeProcess(name, folder, *arguments, parameters=parameters)
+        for name in others:
+            self.processes[name].wait_ready()
+        with (self._folder / "client.log").open("w") as log:
+            self.client = subprocess.Popen(
+                [sys.executable, "-c", CLIENT], cwd=ROOT, stdout=log, stderr=subprocess.STDOUT
+            )
 
     def start_all(self) -> None:
         for name in NODES:
@@ -81,6 +121,9 @@ class Rig:
         return True
 
     def close(self) -> None:
+        if self.client is not None:
+            self.client.kill()
+            self.client.wait(10)
         for process in self.processes.values():
             process.end()
         self.peer.close()

@@ -8,6 +8,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene.frame_graph import LocalGraph
-from endurance.rig import NODES, Rig
+from endurance.rig import Rig
 
 # Models, kernels, buffers and the graph of the room are there after two minutes. Then Python still
 # fills up its own lists of free tuples (2000 of each length) and of names of attributes (4096).
@@ -85,11 +86,12 @@ def allocated_mb(pid: int | str = "self") -> float:
 
 
 def replay(minutes: float, folder: Path) -> tuple[dict[str, Series], Series]:
-    """Memory of each node during an endless replay, and latency of graph_node as a series."""
+    """Memory of each process during an endless replay, and latency of graph_node as a series."""
     rig = Rig(folder)
-    memory, latencies = {name: Series() for name in NODES}, Series()
+    memory, latencies = defaultdict(Series), Series()
     try:
         rig.start_all()
+        rig.start_others()
         started_s = time.monotonic()
         rig.run(FIRST_PAUSE_S)
         for process in rig.processes.values():
@@ -102,6 +104,9 @@ def replay(minutes: float, folder: Path) -> tuple[dict[str, Series], Series]:
             for name, process in rig.processes.items():
                 assert process.alive, process.log[-500:]
                 memory[name].samples.append((now_s, allocated_mb(process.pid)))
+            if rig.client is not None:
+                assert rig.client.poll() is None
+                memory["a Python client"].samples.append((now_s, allocated_mb(rig.client.pid)))
             latency_ms = rig.values.get("graph_node", {}).get("latency mean ms")
             if latency_ms is not None:
                 latencies.samples.append((now_s, float(latency_ms)))
