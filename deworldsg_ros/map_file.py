@@ -239,6 +239,7 @@ def edit_map(path: Path, request: EditRequest) -> EditReply:
         of_paper = MergingConfig(association="paper")
         merging = MergingConfig() if _is_of_surface_rule(path) else of_paper
         builder = read_map(Config(merging=merging), path)
+        builder.graph.skip_to(first_id(path))
         reply = builder.edit(request)
         write_map(builder, path)
     finally:
