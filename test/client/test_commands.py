@@ -15,7 +15,7 @@ from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.client.combine import combine
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.map_file import claim_map, read_map, write_map
+from deworldsg_ros.map_file import claim_map, read_map, write_first_id, write_map
 from deworldsg_ros.scene.camera import invert_pose, rigid_motion
 from deworldsg_ros.wire import messages as wire
 
@@ -109,6 +109,13 @@ def test_a_map_is_edited_and_the_edit_undone(tmp_path, association):
     for _ in range(2):
         printed("edit", path, "undo")
     assert read_map(config, path).full() == before
+
+
+def test_an_edit_of_a_map_gives_no_id_that_was_published(tmp_path):
+    path = saved_map(tmp_path, Config())
+    write_first_id(path, 70)  # as of a node that was killed since
+    answer = json.loads(printed("edit", path, "split", "1", "--json"))
+    assert answer["nodes"] == [70, 71]
 
 
 def test_a_refused_edit_leaves_the_map_as_it_is(tmp_path):
