@@ -339,8 +339,8 @@ class SceneGraph:
         """
         if len(name) > MAX_NAME:
             raise ClientError(
-                f"'{visible(name[:MOST_SHOWN])}…' has {len(name)} characters: expected the name of "
-                f"a class, at most {MAX_NAME}"
+                f"'{visible(name[:MOST_SHOWN])}…' is the name of no class: it has {len(name)} "
+                f"characters, expected at most {MAX_NAME}"
             )
         found = self._understand(name)
         if found is not None:

@@ -323,10 +323,6 @@ class NodeBoxes:
             open_ |= (on >= MIN_CUT) & (on >= seen)
             if open_.any():
                 open_ &= known.shared(_Ends.of(box))
-            # No frame has looked at a new end. Headings change too often to say so of the sides.
-            apart_m = abs(float(known.axes[2] @ (known.center - box.center_m)))
-            if apart_m + abs(float(known.half[2]) - box.size_m[2] / 2.0) >= END_M:
-                open_[2] = True
             if open_.any():
                 sides = open_.any(axis=1).tolist()
         return box if sides == box.at_least else msgspec.structs.replace(box, at_least=sides)

@@ -181,6 +181,7 @@ class GlobalGraph:
             nodes.put(slot, mean_world, covariance_world, classes, weight, observations=1)
         except ValueError:
             nodes.remove(node_id)
+            self._ids.give_back()
             raise
         nodes.confirmed[slot], nodes.existence[slot] = confirmed, -1.0
         nodes.set_surface(slot, surface_points_world)

@@ -102,6 +102,10 @@ class NodeIds:
         self._next_id += 1
         return self._next_id - 1
 
+    def give_back(self) -> None:
+        """The id that was taken last has no node."""
+        self._next_id -= 1
+
     def retire(self, node_id: int, successor: int) -> None:
         """Note that a node was removed, and which node replaces it; 0 = none."""
         self._successors[node_id] = successor

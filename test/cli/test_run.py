@@ -123,6 +123,14 @@ def test_the_tour_is_all_that_a_user_does_with_a_graph(tmp_path):
     assert "MCP find" in done.stdout or "mcp is not installed" in done.stdout
 
 
+@pytest.fixture
+def interrupts():
+    """Ctrl-C interrupts, also in a process of xdist."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def press_ctrl_c_at(monkeypatch, *frames):
     """Press it when these frames have been processed."""
     count = itertools.count(1)
@@ -134,7 +142,7 @@ def press_ctrl_c_at(monkeypatch, *frames):
     monkeypatch.setattr(Album, "add", add)
 
 
-def test_ctrl_c_leaves_the_results_of_the_frames_so_far(tmp_path, monkeypatch):
+def test_ctrl_c_leaves_the_results_of_the_frames_so_far(tmp_path, monkeypatch, interrupts):
     press_ctrl_c_at(monkeypatch, 6)
     result = invoke("run", DEMO_ROOM, "--out", tmp_path, "--map", tmp_path / "room.map")
     assert result.exit_code == 130
@@ -144,7 +152,9 @@ def test_ctrl_c_leaves_the_results_of_the_frames_so_far(tmp_path, monkeypatch):
     assert (tmp_path / "room.map").exists()
 
 
-def test_a_second_ctrl_c_ends_at_once_and_keeps_the_results_of_before(tmp_path, monkeypatch):
+def test_a_second_ctrl_c_ends_at_once_and_keeps_the_results_of_before(
+    tmp_path, monkeypatch, interrupts
+):
     assert invoke("run", DEMO_ROOM, "--out", tmp_path, "--max-frames", 8).exit_code == 0
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     press_ctrl_c_at(monkeypatch, 3)

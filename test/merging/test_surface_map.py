@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec import UNSET
 from numpy.lib.recfunctions import repack_fields
 from support.merging import VOCABULARY, node_states, random_pose
 from support.surfaces import CAMERA, CUP, TABLE, frame
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph import graph_files
-from deworldsg_ros.graph.extent import NodeBoxes, _Ends
 from deworldsg_ros.graph.graph import GlobalGraph
-from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
 from deworldsg_ros.merging import SurfaceMerging
@@ -380,15 +377,3 @@ def test_a_map_continues_the_evidence(tmp_path: Path) -> None:
     again = read_map(config, path)
     assert again.integrate(view(99, TRUE_M)) == [1]
     assert again.full().nodes[0].existence > 0.5
-
-
-def test_an_upper_or_lower_end_that_no_frame_has_looked_at_may_go_on() -> None:
-    boxes = NodeBoxes(NodeTable(1))
-    measured = wire.GravityBox([0.0, 0.0, 1.0], [0.5, 0.5, 0.9], [0.0, 0.0, 0.0, 1.0])
-    boxes._ends[1] = _Ends.of(measured)
-    assert boxes.followed(1, measured).at_least is UNSET
-    lower = wire.GravityBox([0.0, 0.0, 0.7], [0.5, 0.5, 0.3], [0.0, 0.0, 0.0, 1.0])
-    assert boxes.followed(1, lower).at_least == [False, False, True]
-    # Headings of boxes change often: a side that moves says nothing.
-    narrower = wire.GravityBox([0.0, 0.0, 1.0], [0.3, 0.5, 0.9], [0.0, 0.0, 0.0, 1.0])
-    assert boxes.followed(1, narrower).at_least is UNSET
