@@ -2,14 +2,19 @@
 
 import contextlib
 import json
+import time
+from types import SimpleNamespace
 
 import pytest
 from msgspec.structs import replace
 from std_msgs.msg import String
 from support.nodes import NodeProcess, peer, run_to_end
+from support.nodes_bench import alone
+from support.races import beside, filling
 from support.view import SAVED
 
 from deworldsg_ros.client import SceneGraph
+from deworldsg_ros.nodes.fleet_node import FleetNode
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.wire import messages as wire
 
@@ -72,3 +77,20 @@ def test_a_link_without_a_usable_name_is_refused_in_one_line(tmp_path, name):
     assert code == 2
     assert "expected a name of letters" in log
     assert "Traceback" not in log
+
+
+def test_robots_that_come_and_go_while_diagnostics_are_read(endpoint):
+    with alone(FleetNode, {"listen": endpoint}) as node:
+        node._loop.stop()
+        member = SimpleNamespace(T_fleet_world=None, reason="no object in common")
+        tables = (
+            (node._answered_s, 0.0),
+            (node._fleet.members, member),
+            (node._feeds, SimpleNamespace(sent_bytes=1)),
+        )
+        with beside(*(filling(*table) for table in tables)):
+            for _ in range(20_000):
+                node.waiting_for(time.monotonic_ns())
+                node.more_values()
+        for table, _ in tables:
+            table.clear()

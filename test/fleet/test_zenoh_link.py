@@ -1,6 +1,5 @@
 """Feeds and followers over a real Zenoh router; which robots are asked, over an imitated one."""
 
-import sys
 import threading
 import time
 import zlib
@@ -8,6 +7,7 @@ from types import SimpleNamespace as Value
 
 import msgspec
 import pytest
+from support.races import beside, filling
 from support.view import make_graph, make_node
 
 from deworldsg_ros.fleet import zenoh_link
@@ -248,26 +248,9 @@ def test_a_graph_that_grows_without_end_is_dropped(network, robots, monkeypatch)
 
 
 def test_counts_may_be_read_while_robots_come_and_go(robots):
-    """Without a copy, a dictionary that changes meanwhile is an error within milliseconds."""
-    stop = threading.Event()
-
-    def change():
-        while not stop.is_set():
-            for name in "abcdefgh":
-                robots.followers[name] = Follower(None, name)
-            robots.followers.clear()
-
-    interval_s = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    thread = threading.Thread(target=change)
-    thread.start()
-    try:
+    with beside(filling(robots.followers, Follower(None, "ada"))):
         for _ in range(20_000):
             assert robots.received_bytes == 0
-    finally:
-        stop.set()
-        thread.join()
-        sys.setswitchinterval(interval_s)
 
 
 def test_a_robot_that_fails_does_not_stop_the_others(network, robots):

@@ -3,6 +3,7 @@
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 from importlib.metadata import distributions
@@ -54,6 +55,48 @@ def test_a_middleware_without_security_ends_the_node(tmp_path, monkeypatch, stra
     assert code == 2, output
     assert "error: ROS_SECURITY_ENABLE is true, but" in output
     assert "Traceback" not in output
+
+
+def can_make_keys() -> bool:
+    ros2 = shutil.which("ros2")
+    if WHEELS or ros2 is None:
+        return False
+    call = [ros2, "security", "create_keystore", "--help"]
+    return subprocess.run(call, capture_output=True, timeout=60).returncode == 0
+
+
+@pytest.mark.skipif(not can_make_keys(), reason="needs a ROS 2 of the system, with sros2")
+def test_with_keys_only_nodes_with_keys_see_the_graph(root_dir, tmp_path, monkeypatch):
+    keys, policies = tmp_path / "keys", root_dir / "config" / "sros2" / "policies.xml"
+    for words in (
+        ("create_keystore", keys),
+        ("generate_artifacts", "-k", keys, "-p", policies),
+        ("create_enclave", keys, "/stranger"),  # has a key, and no right to any topic
+    ):
+        subprocess.run(["ros2", "security", *words], check=True, timeout=120)
+
+    def secure(patch: pytest.MonkeyPatch) -> None:
+        patch.setenv("ROS_SECURITY_ENABLE", "true")
+        patch.setenv("ROS_SECURITY_STRATEGY", "Enforce")
+        patch.setenv("ROS_SECURITY_KEYSTORE", str(keys))
+
+    def enclave(name: str) -> tuple[str, ...]:
+        return ("--ros-args", "--enclave", f"/{name}")
+
+    with monkeypatch.context() as patch:
+        secure(patch)
+        graph = NodeProcess("graph_node", tmp_path, *enclave("graph_node"))
+        viewer = NodeProcess("viewer_node", tmp_path, *enclave("viewer_node"))
+        code, output = run_to_end("lifting_node", tmp_path, *enclave("stranger"))
+        assert code != 0, output
+    with graph, viewer:
+        graph.wait_ready()
+        viewer.wait_ready()
+        with peer() as me:  # without keys
+            me.spin_for(5.0)
+            assert not me.node.count_publishers("/scene_graph")
+        for process in (graph, viewer):
+            assert process.interrupt() == 0, process.log
 
 
 @pytest.mark.parametrize(
