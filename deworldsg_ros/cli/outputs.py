@@ -130,7 +130,7 @@ def write_report(out: Path, report: Mapping[str, Any]) -> None:
 
 def print_files(console: Console, out: Path) -> None:
     """Print the paths of the results."""
-    console.print(f"results in {out}:", highlight=False, soft_wrap=True)
+    console.print(Text(f"results in {visible(str(out))}:"), highlight=False, soft_wrap=True)
     for name, meaning in (
         (PAGE_FILE, "3D view, open it in a browser"),
         (PICTURE_FILE, "top view"),
@@ -142,7 +142,7 @@ def print_files(console: Console, out: Path) -> None:
         (REPORT_FILE, "frames, drops by reason, times"),
     ):
         if (out / name).exists():
-            line = Text.assemble(f"  {out / name}  ", (meaning, "dim"))
+            line = Text.assemble(f"  {visible(str(out / name))}  ", (meaning, "dim"))
             console.print(line, highlight=False, soft_wrap=True)
 
 

@@ -19,6 +19,8 @@ from deworldsg_ros.scene.errors import ClientError
 
 # Directions around an object that are tried.
 DIRECTIONS = 72
+# Farther away, no camera sees an object of a room.
+MAX_DISTANCE_M = 10.0
 # Half the width of a robot, and its height. A box above the robot is not in its way.
 ROBOT_RADIUS_M, ROBOT_HEIGHT_M = 0.3, 1.5
 # Heights above the floor at which the seen space is looked at; below, the floor itself is seen.
@@ -133,10 +135,12 @@ def goal_near(
         space: what the camera has seen as free; None = not known.
 
     Raises:
-        ClientError: if the distance is not positive, or no direction is free.
+        ClientError: if the distance is not positive or too large, or no direction is free.
     """
-    if not (math.isfinite(distance) and distance > 0):
-        raise ClientError(f"distance {distance}: expected a positive number of metres")
+    if not 0 < distance <= MAX_DISTANCE_M:
+        raise ClientError(
+            f"distance {distance}: expected a positive number of metres, at most {MAX_DISTANCE_M:g}"
+        )
     obstacles = [item for item in others if item.id != target.id]
     floor = floor_m([target, *obstacles])
     low = [item for item in obstacles if item.footprint.low < floor + ROBOT_HEIGHT_M]

@@ -17,7 +17,8 @@ from deworldsg_ros.base.words import stamp_ns_from_text
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.evaluation.predictions import load_pickle, read_predictions
 from deworldsg_ros.recordings.bags.storage import MAX_CHUNK_BYTES, bound_decompression, decompress
-from deworldsg_ros.scene.errors import ConfigurationError, EvaluationError
+from deworldsg_ros.recordings.folders.frame_files import read_pose
+from deworldsg_ros.scene.errors import ConfigurationError, EvaluationError, RefusedInput
 from deworldsg_ros.streams.images import decode, encoded_size
 
 YAML = (
@@ -52,6 +53,13 @@ def test_json_and_stamps_have_one_error(reader, text):
 def test_options_are_finite_numbers(value):
     with pytest.raises(ConfigurationError, match="--set"):
         effective_config(None, [f"inputs.max_depth_m={value}"])
+
+
+def test_a_pose_file_of_megabytes_is_not_parsed(tmp_path):
+    path = tmp_path / "frame-000000.pose.txt"
+    path.write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n" + " " * 65_536)
+    with pytest.raises(RefusedInput, match="65568 bytes: expected at most 65536"):
+        read_pose(path)
 
 
 def test_the_size_of_an_image_is_known_before_it_is_decoded():

@@ -108,3 +108,12 @@ def test_brackets_in_frames_paths_and_notes_are_text(tmp_path, name):
     outputs.print_drops(terminal, [name], {"recording": {name: 1}}, {name: name})
     text = output.getvalue().replace(str(folder), "FOLDER")
     assert text.count("FOLDER") == 2 and text.count(name) == 3
+
+
+def test_a_name_of_a_folder_cannot_write_on_the_terminal(tmp_path, capsys):
+    folder = tmp_path / "a\x1b[31m[red]b"
+    folder.mkdir()
+    (folder / "run.json").write_text("{}")
+    outputs.print_files(Console(width=400), folder)
+    shown = capsys.readouterr().out
+    assert "\x1b" not in shown and shown.count("[red]b") == 2

@@ -117,26 +117,27 @@ class Dataset(ABC):
         """Nothing to close: files are open only while they are read."""
 
 
-def read_file(path: Path, folder: Path | None = None) -> bytes:
+def read_file(path: Path, folder: Path | None = None, most_bytes: int = MAX_FILE_BYTES) -> bytes:
     """Content of a file of a data set.
 
     Args:
         path: of the file.
         folder: folder in which it has to lie, with all links followed; None = its own.
+        most_bytes: that it may have.
 
     Raises:
-        RecordingError: if it cannot be read, or lies elsewhere.
+        RecordingError: if it cannot be read, is larger, or lies elsewhere.
     """
     try:
-        return read_regular(confined(folder or path.parent, path.absolute()), MAX_FILE_BYTES)
+        return read_regular(confined(folder or path.parent, path.absolute()), most_bytes)
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def read_text(path: Path) -> str:
-    """Content of a text file; raises RecordingError if it cannot be read or is not UTF-8."""
+def read_text(path: Path, most_bytes: int = MAX_FILE_BYTES) -> str:
+    """Content of a text file; errors as `read_file`, and RecordingError if it is not UTF-8."""
     try:
-        return read_file(path).decode()
+        return read_file(path, most_bytes=most_bytes).decode()
     except UnicodeDecodeError as error:
         raise RecordingError(f"{path} is no UTF-8 text: {error}") from error
 

@@ -30,6 +30,8 @@ from deworldsg_ros.streams.poses import unlikely_motion
 
 # Stamp of frame 0: many programs read a ROS time of zero as "unset".
 FIRST_STAMP_NS = 10**9
+# A 4x4 matrix has a few hundred.
+MAX_POSE_BYTES = 65_536
 # Single pictures have more steps than this that are too wide for video.
 WIDE_FRACTION = 0.2
 COLOR_NAME = re.compile(r"frame-(\d+)\.color\.(?:jpg|jpeg|png)\Z")
@@ -171,7 +173,7 @@ def color_files(folder: Path) -> dict[int, Path]:
 def read_pose(path: Path) -> Float64:
     """The (4, 4) matrix of a pose file; raises RefusedInput ``invalid_pose``."""
     try:
-        T = np.array(read_text(path).split(), np.float64).reshape(4, 4)
+        T = np.array(read_text(path, MAX_POSE_BYTES).split(), np.float64).reshape(4, 4)
     except (RecordingError, ValueError) as error:
         raise RefusedInput("invalid_pose", f"{path}: {error}; expected a 4x4 matrix") from error
     check_pose(T)
