@@ -22,6 +22,7 @@ from deworldsg_ros.relations.geometry import (
     in_reach,
     measure,
     pair_features,
+    plan_gaps,
     rotation_to_upright,
     upright,
 )
@@ -43,7 +44,7 @@ UP_STEP = 0.01
 # Pairs in arrays at once, so that a whole map needs no large ones.
 AT_ONCE = 1024
 
-_GAP, _BOTTOM_STEP = FEATURES.index("gap_m"), FEATURES.index("bottom_over_bottom_m")
+_BOTTOM_STEP = FEATURES.index("bottom_over_bottom_m")
 
 
 def joined(first: Int64, second: Int64 | Iterable[int]) -> Int64:
@@ -140,8 +141,7 @@ class PairTable:
         """
         beliefs, (one, other) = self.beliefs, self.shapes[self._graph.pairs.rows["slots"][rows].T]
         near = beliefs["judged"][rows] & np.isfinite(beliefs["gap_m"][rows])
-        apart = np.maximum(one["low"] - other["high"], other["low"] - one["high"])[:, :2]
-        gaps = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
+        gaps = plan_gaps(one, other)
         steps = one["low"][:, 2] - other["high"][:, 2], other["low"][:, 2] - one["high"][:, 2]
         return Between(*(np.rint(100.0 * values) / 100.0 + 0.0 for values in (gaps, *steps))), near
 
@@ -406,7 +406,7 @@ class PairTable:
         inputs = self._inputs.make(features.reshape(2 * len(rows), -1), *known, *both)
         beliefs["state_logits"][rows] = self._model.states_of(inputs)
         beliefs["judged"][rows] = True
-        beliefs["gap_m"][rows] = features[0, :, _GAP]
+        beliefs["gap_m"][rows] = plan_gaps(shapes[first], shapes[second])
         beliefs["bottom_step_m"][rows] = features[0, :, _BOTTOM_STEP]
         beliefs["centre_step_m"][rows] = centre_steps(shapes, first, second)
 

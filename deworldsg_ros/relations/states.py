@@ -57,6 +57,9 @@ SHAPE = np.dtype(
         ("count", np.int64),
         ("low", np.float64, 3),
         ("high", np.float64, 3),
+        # The same along the two horizontal diagonals, x + y and y - x.
+        ("slant_low", np.float64, 2),
+        ("slant_high", np.float64, 2),
         ("mean", np.float64, 3),
         ("covariance", np.float64, (3, 3)),
         # The class of the highest probability, and whether it is a table, and a seat.
@@ -86,7 +89,7 @@ BELIEF = np.dtype(
         # Both nodes have enough points. Then the logits are those of the physical model.
         ("judged", np.bool_),
         ("state_logits", np.float32, STATE_COUNT),
-        # Horizontal gap of the bounds; infinite out of reach. Difference of the heights of the
+        # Horizontal gap of the outlines; infinite out of reach. Difference of the heights of the
         # bottoms, and horizontal distance of the centres, where in reach.
         ("gap_m", np.float32),
         ("bottom_step_m", np.float32),
@@ -102,11 +105,12 @@ BELIEF = np.dtype(
         ("with_", np.uint8, 2),
         ("live", np.bool_),
         # After what others exclude: that one end rests on the other; that both stand side by side;
-        # that the pair counts among neighbours; that it is one of the nearest of an end.
+        # that the pair counts among neighbours; that it is one of the nearest of an end, for each
+        # end.
         ("kept", np.float64, 2),
         ("near", np.float32),
         ("eligible", np.bool_),
-        ("close", np.uint8, 2),
+        ("close", np.float32, 2),
         ("relations", np.float32, (2, NONE + 1)),
         # Whether a prior may enter, by classes of subject and object; and a number for the
         # probabilities in the message, 0 = no message.

@@ -185,6 +185,39 @@ def test_features_equal_those_of_the_reference(seed: int) -> None:
     np.testing.assert_allclose(geometry.centre_steps(clouds.shapes, *pairs.T), steps, rtol=1e-12)
 
 
+def outlines_of(points) -> np.ndarray:
+    """The shapes of points (n, K, 3)."""
+    shapes = np.zeros(len(points), SHAPE)
+    counts = np.full(len(points), points.shape[1])
+    geometry.measure(shapes, np.arange(len(points)), points, counts, np.eye(3))
+    return shapes
+
+
+@given(seed=seeds)
+def test_the_gap_of_outlines_lies_between_those_of_bounds_and_of_convex_hulls(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(2, 20, 3)).astype(np.float32)  # so few that none is cut off
+    points[1] += rng.uniform(-8, 8, 3)
+    one, other = outlines_of(points)[:, None]
+    found = geometry.plan_gaps(one, other).item()
+    assert found == geometry.plan_gaps(other, one).item()
+    angles = np.linspace(0, 2 * np.pi, 3600)
+    along = points[..., :2] @ np.array([np.cos(angles), np.sin(angles)])
+    hull = float((along[1].min(axis=0) - along[0].max(axis=0)).max())
+    apart = np.maximum(one["low"] - other["high"], other["low"] - one["high"])[0, :2]
+    assert np.linalg.norm(np.maximum(apart, 0)) <= found <= max(0, hull) + 1e-3
+
+
+def test_squares_that_stand_askew_are_apart() -> None:
+    steps = np.linspace(-0.5, 0.5, 11)
+    square = np.stack([*np.meshgrid(steps, steps), np.zeros((11, 11))], axis=-1).reshape(-1, 3)
+    turn = np.array([[1, -1, 0], [1, 1, 0], [0, 0, 2**0.5]]) / 2**0.5
+    points = np.stack([square, square + [1.2, 0, 0]]) @ turn.T
+    one, other = outlines_of(points.astype(np.float32))[:, None]
+    assert (one["high"] > other["low"])[0, :2].all()
+    assert geometry.plan_gaps(one, other).item() == pytest.approx(0.2, abs=0.05)
+
+
 # --- shapes --------------------------------------------------------------------------------------
 
 

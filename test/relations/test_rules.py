@@ -152,7 +152,7 @@ class Followed:
         steps = (beliefs[name] for name in ("gap_m", "bottom_step_m", "centre_step_m"))
         near = near_probabilities(self.pairs, kept, on_floor, *steps, states[:, 0], with_)
         near = np.clip(near, 1.0 - rules.NEAR_CERTAINTY, rules.NEAR_CERTAINTY)
-        near = expit(logit(near) + self.worth * self.near_logits)
+        near = rules.MAX_NEAR * expit(logit(near) + self.worth * self.near_logits)
         relations = np.zeros((len(self.pairs), 2, NONE + 1))
         for end in (0, 1):
             for state in range(1, STATE_COUNT):

@@ -1,5 +1,7 @@
 """The rules of `relations.rules` for all pairs at once, in plain NumPy: slow and obvious."""
 
+import itertools
+
 import numpy as np
 from scipy.special import expit
 
@@ -17,6 +19,7 @@ from deworldsg_ros.relations.rules import (
     NEAR_SUPPORT_M,
     NEAR_SUPPORT_SPREAD_M,
     NEAREST,
+    RANK_SPREAD_M,
     SEAT_GAP_M,
 )
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
@@ -87,11 +90,20 @@ def near_probabilities(
     together *= expit((NEAR_LEVEL_M - np.abs(bottom_steps_m)) / NEAR_LEVEL_SPREAD_M)
     near = np.minimum(on_one_floor + together, 1.0)
     eligible = near * unrelated > MIN_NEIGHBOUR
-    distances_m = np.where(eligible, gaps_m + CENTRE_FRACTION * centre_steps_m, np.inf)
-    close = np.zeros(pairs.shape, np.bool_)
+    distances_m = gaps_m + CENTRE_FRACTION * centre_steps_m
+    close = np.zeros(pairs.shape)
     for item in range(len(on_floor)):
-        rows, ends = np.nonzero(pairs == item)
-        nearest = np.argsort(distances_m[rows], kind="stable")[:NEAREST]
-        close[rows[nearest], ends[nearest]] = eligible[rows[nearest]]
-    near = np.where(close.all(axis=1) | table_and_seat, near, 0.0)
-    return np.asarray(NEAR_CERTAINTY * near)
+        rows, ends = np.nonzero((pairs == item) & eligible[:, None])
+        for row, end in zip(rows, ends):
+            steps_m = distances_m[row] - distances_m[rows[rows != row]]
+            close[row, end] = at_most(NEAREST - 1, expit(steps_m / RANK_SPREAD_M))
+    return np.asarray(NEAR_CERTAINTY * near * np.where(table_and_seat, 1.0, close.prod(axis=1)))
+
+
+def at_most(number: int, probabilities: Float64) -> float:
+    """Probability that at most this many of some independent events (n,) happen."""
+    return sum(
+        float(np.prod(np.where(happen, probabilities, 1.0 - probabilities)))
+        for happen in itertools.product((False, True), repeat=len(probabilities))
+        if sum(happen) <= number
+    )

@@ -81,6 +81,8 @@ class Bodies:
         for other in group:
             if other is a or other is b or self.top(other) < low + 0.25 * (top - low):
                 continue
+            if self.bottom(other) >= top:  # on a board above them
+                continue
             if any(len(clip(strip, outline)) >= 3 for outline in self._outlines[other.number]):
                 return True
         return False
