@@ -236,7 +236,7 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = ""
     world_up: Annotated[
-        Literal["auto", "z", "y", "-y"],
+        Literal["auto", "x", "-x", "y", "-y", "z", "-z"],
         option(
             "axis of the world frame that points up; auto = z (the ROS convention) if the camera "
             "poses agree with it, else the axis estimated from the poses"
@@ -263,11 +263,12 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_scale: Annotated[
         float,
         option(
-            "metres per unit of a 16UC1 depth image; the default is millimetres (REP 118)",
-            gt=0,
+            "metres per unit of a depth image; 0 = by its encoding (REP 118): millimetres in "
+            "16UC1, metres in 32FC1",
+            ge=0,
             le=1,
         ),
-    ] = 0.001
+    ] = 0.0
     max_depth_m: Annotated[
         float,
         option(

@@ -22,8 +22,10 @@ from deworldsg_ros.doctor import Finding, FrameSampler, Observations, find
 from deworldsg_ros.graph.embeddings import embeddings_path
 from deworldsg_ros.graph.graph_files import GRAPH_FILE
 from deworldsg_ros.graph.provenance import path_beside, space_path
+from deworldsg_ros.recordings.bags.bag import BagSource
+from deworldsg_ros.recordings.posing import PosedSource
 from deworldsg_ros.recordings.recording import Recording
-from deworldsg_ros.ros.health import UNMATCHED_PREFIX
+from deworldsg_ros.ros.health import REASONS, UNMATCHED_PREFIX
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import RgbdFrame, UpEstimator
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -100,7 +102,7 @@ def show_graph(
         graph: the graph, with surface points.
         console: terminal.
         T_world_cameras: poses (4, 4) of the processed frames.
-        world_up: `inputs.world_up`: auto, z, y or -y.
+        world_up: `inputs.world_up`.
         frames: some frames of the recording, for photos of the objects.
     """
     # Imported here because matplotlib takes a second to load.
@@ -219,17 +221,24 @@ class RunObserver:
         reasons: Counter[str] = Counter()
         for counts in drops.values():
             reasons.update(counts)
+        is_given = pipeline.config.inputs.world_up != "auto"
+        source = recording.source
+        if isinstance(source, PosedSource):
+            source = source.original
         seen = Observations(
+            headers=source.headers() if isinstance(source, BagSource) else {},
             images=recording.frame_count,
             frames=self._turns.total(),
             drops=reasons,
             examples=recording.reasons,
+            remedies=REASONS,
             nodes=0 if graph is None else len(graph.nodes),
             hidden={} if builder is None else builder.hidden,
             detections=self._detections,
             classes=perception.vocabulary.classes if isinstance(perception, Perception) else (),
             sizes=() if graph is None else sizes_of(graph),
             turns=self._turns,
+            up_world=() if graph is None or is_given else tuple(graph.up or ()),
             checks=self._sampler.checks(),
             unused_detector=unused,
             its_settings=settings,

@@ -11,11 +11,16 @@ from deworldsg_ros.base.words import counted
 from deworldsg_ros.doctor.frame_checks import (
     BODY,
     FACTOR,
+    FOCAL,
     GIVEN,
     INVERSE,
     LATE,
+    OPENGL,
     STILL,
+    FrameChecks,
+    Header,
     Observations,
+    best_factor,
 )
 
 # Longest side of usual indoor objects, metres, of the classes that several detectors know.
@@ -37,8 +42,43 @@ MIN_VALID_DEPTH = 0.2
 MIN_SHIFT_PX, MIN_SHIFT_GAIN = 8.0, 0.15
 # Another assumption about the poses has to fit by so much better.
 MIN_FIT_GAIN = 0.1
+# It has to fit well; of frames from different places, less is enough if nothing else fits half as
+# well.
+MIN_OTHER_FIT, MIN_CLEAR_FIT = 0.6, 0.35
 # Right poses give 0.95 and more, also with the noise of a Kinect; trembling ones above 0.8.
 MIN_FIT = 0.65
+# The same of frames from different places: right ones give 0.85 and more.
+MIN_WIDE_FIT = 0.3
+# Frames from different places agree that much better with another factor.
+MIN_WIDE_GAIN = 0.03
+MIN_ZOOM_GAIN = 0.1
+# Half of the depths of a room are nearer than this. The least is a hand before the camera.
+LEAST_MIDDLE_M, MOST_MIDDLE_M = 0.05, 8.0
+# Intrinsics of one camera differ by less than this part of the focal length.
+MOST_OTHER = 0.03
+# Topics of depth that is registered to colour, whatever its frame.
+REGISTERED = ("aligned", "registered", "depth_to_rgb", "depth_to_color")
+REGISTER_REMEDY = (
+    "Use the registered depth of the driver (aligned_depth_to_color of a RealSense with "
+    "align_depth.enable:=true, depth_registered of OpenNI)."
+)
+INTRINSICS_REMEDY = (
+    "Name the camera_info beside the colour images (--camera-info, or camera_info:=), or give "
+    "--intrinsics FX,FY,CX,CY of the images."
+)
+SCALE_REMEDY = (
+    "Set `inputs.depth_scale` to the metres per unit of the depth image (0.001 = mm, 0.0001 = "
+    "0.1 mm, 0.0002 = TUM, 1 = m)."
+)
+# Causes of which one explains the others.
+GEOMETRY = {
+    "depth_unit", "not_registered", "other_intrinsics", "little_depth", "late_poses",
+    "poses_of_the_body", "poses_of_opengl", "poses_inverted", "poses_do_not_fit",
+}  # fmt: skip
+# The z axis counts as up to about 15 degrees.
+NEARLY_UP = 0.97
+# Images of a camera that stands still agree.
+MIN_STILL_FIT = 0.9
 FEW_DETECTIONS_PER_FRAME = 0.5
 # A reason that concerns fewer frames is not worth a sentence.
 MIN_PART = 0.05
@@ -73,8 +113,17 @@ Check = Callable[[Observations], Iterator[Finding]]
 
 
 def find(seen: Observations) -> list[Finding]:
-    """All findings, the most basic ones first."""
-    return [finding for check in CHECKS for finding in check(seen)]
+    """All findings, the most basic ones first.
+
+    Of what makes depth, colour and poses disagree, only the first is named: it explains the rest.
+    """
+    found: list[Finding] = []
+    explained = False
+    for finding in (finding for check in CHECKS for finding in check(seen)):
+        if finding.code not in GEOMETRY or not explained:
+            found.append(finding)
+        explained = explained or finding.code in GEOMETRY
+    return found
 
 
 def _nodes(seen: Observations) -> Iterator[Finding]:
@@ -89,14 +138,19 @@ def _nodes(seen: Observations) -> Iterator[Finding]:
 
 
 def _topics(seen: Observations) -> Iterator[Finding]:
-    for topic, others in seen.silent.items():
-        if others:
-            cause = f"Messages of this type are published on {', '.join(others)}."
-            remedy = f"Start with that name: the launch argument, or `--ros-args -r {topic}:=NAME`."
-        else:
-            cause = "No topic of this type is published at all."
-            remedy = "Start the driver, in the same ROS domain (`ros2 topic list`)."
-        yield Finding("no_publisher", f"Nobody publishes {topic}.", cause, remedy)
+    if seen.silent:
+        others = list(dict.fromkeys(name for names in seen.silent.values() for name in names))
+        yield Finding(
+            "no_publisher",
+            f"Nobody publishes {', '.join(seen.silent)}.",
+            f"Of these types there are: {', '.join(others)}."
+            if others
+            else "No topics of these types are published at all.",
+            "Start with their names: the launch arguments rgb, depth, camera_info and pose, or "
+            f"`--ros-args -r {next(iter(seen.silent))}:=NAME`."
+            if others
+            else "Start the driver, in the same ROS domain (`ros2 topic list`).",
+        )
     for text in seen.incompatible:
         yield Finding(
             "qos",
@@ -153,20 +207,6 @@ DROPS = {
         "Depth is not registered to colour, or the camera_info is that of another stream.",
         "Publish registered depth (align_depth.enable:=true of a RealSense) and name its topic.",
     ),
-    "no_pose": (
-        "late_poses",
-        "{n} images have no pose within `inputs.pose_slop_s`.",
-        "The poses come late, too rarely, or with stamps of another clock.",
-        "Compare the stamps of images and poses; raise `inputs.pose_slop_s` for slow poses; or use "
-        "--odometry.",
-    ),
-    "pose_jump": (
-        "pose_jumps",
-        "The pose jumped at {n} images.",
-        "The localisation jumps, or two sources publish on one topic.",
-        "Look for a second publisher of poses, and use smooth poses (odom instead of map), or "
-        "--odometry.",
-    ),
     "wrong_frame": (
         "other_frame",
         "{n} poses are in another world frame than the first.",
@@ -179,6 +219,21 @@ DROPS = {
         "The transform from the robot to the optical frame is not published.",
         "Publish it (robot_state_publisher), or set `inputs.pose_source` to odometry if the poses "
         "are those of the camera.",
+    ),
+    "no_pose": (
+        "late_poses",
+        "{n} images have no pose within `inputs.pose_slop_s`.",
+        "The poses come late, too rarely, or with stamps of another clock.",
+        "Compare the stamps of images and poses; raise `inputs.pose_slop_s` for slow poses; or use "
+        "--odometry.",
+    ),
+    "pose_jump": (
+        "pose_jumps",
+        "The pose jumped at {n} images.",
+        "The localisation jumps, two sources publish on one topic, or the positions are not in "
+        "metres. {example}",
+        "Look for a second publisher of poses, and use smooth poses (odom instead of map), or "
+        "--odometry.",
     ),
     "no_camera_info": (
         "no_camera_info",
@@ -213,10 +268,22 @@ def _drops(seen: Observations) -> Iterator[Finding]:
         if count and count >= MIN_PART * (seen.images or count):
             example = seen.examples.get(reason, "")
             yield Finding(code, problem.format(n=count), cause.format(example=example), remedy)
+    for reason, count in seen.drops.items():
+        known = reason in DROPS or reason.startswith(("lost_", "unmatched_"))
+        if count and count >= MIN_PART * (seen.images or count) and not known:
+            example = seen.examples.get(reason, "")
+            yield Finding(
+                reason,
+                f"{counted(count, 'message')} or frames are refused: {reason}.",
+                f"For example: {example}." if example else "",
+                seen.remedies.get(reason, ""),
+            )
 
 
 def _missing(seen: Observations) -> Iterator[Finding]:
     for text in seen.missing:
+        if any(f" on {topic} " in text for topic in seen.silent):
+            continue  # nobody publishes it
         lagging = " waits for " in text
         yield Finding(
             "late_input" if lagging else "no_input",
@@ -228,54 +295,178 @@ def _missing(seen: Observations) -> Iterator[Finding]:
         )
 
 
+def _headers(seen: Observations) -> Iterator[Finding]:
+    """What the messages say about themselves, before any picture is looked at."""
+    rgb, depth, info = (seen.headers.get(name) for name in ("rgb", "depth", "camera_info"))
+    if depth is not None and depth.middle_m is not None:
+        yield from _unit(depth, depth.middle_m)
+    if rgb is None:
+        return
+    if depth is not None and info is not None:
+        yield from _other_camera(rgb, depth, info)
+    camera = None if info is None else info.intrinsics
+    if info is None or camera is None or rgb.size is None:
+        return
+    if (camera.width, camera.height) != rgb.size and camera.width > 0:
+        yield Finding(
+            "other_intrinsics",
+            f"The camera_info on {info.topic} is for images of {camera.width} x {camera.height} "
+            f"pixels, and those on {rgb.topic} have {rgb.size[0]} x {rgb.size[1]}.",
+            "It is that of another stream, or the images were resized without it.",
+            INTRINSICS_REMEDY,
+        )
+
+
+def _unit(depth: Header, middle_m: float) -> Iterator[Finding]:
+    if LEAST_MIDDLE_M <= middle_m <= MOST_MIDDLE_M:
+        return
+    floats = depth.encoding.startswith("32FC1")
+    yield Finding(
+        "depth_unit",
+        f"The depths on {depth.topic} ({depth.encoding}) are {middle_m:.2g} m in the middle.",
+        "These are millimetres, and 32FC1 means metres (REP 118)."
+        if floats and middle_m > MOST_MIDDLE_M
+        else "Depth is in another unit than expected.",
+        SCALE_REMEDY,
+    )
+
+
+def _other_camera(rgb: Header, depth: Header, info: Header) -> Iterator[Finding]:
+    """Whether depth is of another camera than colour, by its camera_info and its frame."""
+    ours, theirs = info.intrinsics, depth.intrinsics
+    if ours is not None and theirs is not None:
+        # Of another size, the intrinsics of one camera have another scale.
+        scale = theirs.width / ours.width if ours.width and theirs.width else 1.0
+        both = [np.array([k.fx, k.fy, k.cx, k.cy]) for k in (ours, theirs)]
+        if (np.abs(both[1] - scale * both[0]) <= MOST_OTHER * theirs.fx).all():
+            return
+        seen = (
+            f"The camera_info beside depth has the focal length {theirs.fx:.0f} and the middle "
+            f"{theirs.cx:.0f}, {theirs.cy:.0f}; that of colour has {ours.fx:.0f} and "
+            f"{ours.cx:.0f}, {ours.cy:.0f}."
+        )
+    elif depth.frame_id != rgb.frame_id and "" not in (depth.frame_id, rgb.frame_id):
+        if any(word in depth.topic.lower() for word in REGISTERED):
+            return
+        seen = f"It is in the frame {depth.frame_id}, and colour is in {rgb.frame_id}."
+    else:
+        return
+    yield Finding(
+        "not_registered",
+        f"The depth on {depth.topic} is that of another camera than the colour on {rgb.topic}.",
+        seen,
+        REGISTER_REMEDY,
+    )
+
+
 def _depth(seen: Observations) -> Iterator[Finding]:
     if seen.checks is not None and seen.checks.valid_depth < MIN_VALID_DEPTH:
         yield Finding(
             "little_depth",
             f"Only {seen.checks.valid_depth:.0%} of the pixels have a depth.",
-            "Most values are zero, or beyond `inputs.max_depth_m`: often millimetres in a 32FC1 "
-            "image, or another unit in a 16UC1 image.",
-            "Set `inputs.depth_scale` to the metres per unit (0.001 = mm, 0.0002 = TUM), and "
-            "`inputs.max_depth_m` to the range of the camera.",
+            "Most values are zero, or beyond `inputs.max_depth_m`: the surfaces are too near, too "
+            "far, black or of glass, or the unit is another.",
+            "Look at the depth image; set `inputs.max_depth_m` to the range of the camera. "
+            + SCALE_REMEDY,
         )
-    sized = [(name, size) for name, size in seen.sizes if name in USUAL_SIZES_M]
-    ratios = [size / USUAL_SIZES_M[name] for name, size in sized]
-    factors = _factors(seen)
-    ratio = float(np.median(ratios)) if len(ratios) >= MIN_SIZED else 1.0
-    if ratio > MOST_SIZE_RATIO or ratio < 1 / MOST_SIZE_RATIO or factors:
-        name, size = (
-            sorted(sized, key=lambda item: item[1] / USUAL_SIZES_M[item[0]])[len(sized) // 2]
-            if sized
-            else ("", 0.0)
-        )
-        example = f": a {name} of {size:.2g} m" if name else ""
-        times = f"{ratio:.2g} times as large as usual{example}"
-        problem = (
-            f"Objects are {times}."
-            if not factors
-            else (
-                f"Depth fits the motion of the camera only if it is multiplied by {factors[0]}"
-                + (f"; objects are {times}." if sized else ".")
+
+
+def _motion(seen: Observations) -> Iterator[Finding]:
+    """The one assumption that explains best why depth does not fit the motion of the camera."""
+    if seen.checks is None or GIVEN not in seen.checks.fits:
+        return
+    fits, wide = seen.checks.fits, seen.checks.wide
+    if _stands(seen.checks):
+        if fits[GIVEN] < MIN_STILL_FIT:
+            yield Finding(
+                "poses_do_not_fit",
+                "The images move, and the poses stand still.",
+                "The localisation does not run, or these are the poses of something else.",
+                "Look at the poses (`ros2 topic echo`), or use --odometry.",
             )
+        return
+    # How much of the disagreement an assumption explains.
+    explained: dict[str, float] = {}
+    for name, fit in fits.items():
+        gain = fit - fits[GIVEN]
+        least = min(MIN_FIT_GAIN, (1.0 - fits[GIVEN]) / 2)
+        if name != GIVEN and fit >= MIN_OTHER_FIT and gain >= least > MIN_WIDE_GAIN:
+            explained[name] = gain / (1.0 - fits[GIVEN])
+    others = max((wide[name] for name in (STILL, BODY, INVERSE) if name in wide), default=0.0)
+    for kind in (FACTOR, FOCAL):
+        factor = best_factor(wide, kind)
+        if factor is not None:
+            fit = max(fit for name, fit in wide.items() if name.startswith(kind))
+            rest = max(wide[GIVEN], others)
+            clear = fit >= min(MIN_OTHER_FIT, max(MIN_CLEAR_FIT, 2.0 * rest))
+            if clear and fit >= max(wide[GIVEN] + MIN_WIDE_GAIN, others + MIN_FIT_GAIN):
+                explained[f"{kind}{factor}"] = (fit - wide[GIVEN]) / (1.0 - wide[GIVEN])
+    if explained:
+        yield _explained(max(explained, key=lambda name: explained[name]), seen.checks)
+    elif fits[GIVEN] < MIN_FIT or wide.get(GIVEN, 1.0) < MIN_WIDE_FIT:
+        yield Finding(*POSES[STILL])
+
+
+def _stands(checks: FrameChecks) -> bool:
+    return checks.travel_m < STILL_M and checks.turn_deg < STILL_DEG
+
+
+def _explained(best: str, checks: FrameChecks) -> Finding:
+    if best in POSES:
+        return Finding(*POSES[best])
+    if best.startswith(LATE):
+        delay_s = float(best[len(LATE) :])
+        return Finding(
+            "late_poses",
+            f"The images fit the poses much better {abs(delay_s):g} s "
+            f"{'later' if delay_s > 0 else 'earlier'}.",
+            "The stamps of the poses are those of their arrival, or the clocks differ.",
+            "Stamp poses with the time at which the camera was there, and synchronise the clocks.",
         )
+    if best.startswith(FACTOR):
+        factor = float(best[len(FACTOR) :])
+        return Finding(
+            "depth_unit",
+            f"Depth fits the motion of the camera only if it is multiplied by {factor:.3g}.",
+            "Depth is in another unit than expected, or the poses are not in metres.",
+            SCALE_REMEDY + f" For poses, divide the positions by {factor:.3g}.",
+        )
+    factor = float(best[len(FOCAL) :])
+    if checks.zoom_gain >= MIN_ZOOM_GAIN:
+        return Finding(
+            "not_registered",
+            f"Depth has {factor:.2g} times the focal length of colour.",
+            "It is the image of another camera, and not registered to colour.",
+            REGISTER_REMEDY,
+        )
+    return Finding(
+        "other_intrinsics",
+        "The images fit the motion of the camera only if the focal length is multiplied by "
+        f"{factor:.2g}.",
+        "The camera_info or the intrinsics are those of another camera or of another image size.",
+        INTRINSICS_REMEDY,
+    )
+
+
+def _sizes(seen: Observations) -> Iterator[Finding]:
+    """Objects far from their usual size, where no motion tells the unit of depth."""
+    if seen.checks is not None and seen.checks.wide.get(GIVEN, 0.0) >= MIN_FIT:
+        return
+    sized = sorted(
+        (size / USUAL_SIZES_M[name], name, size)
+        for name, size in seen.sizes
+        if name in USUAL_SIZES_M
+    )
+    if len(sized) < MIN_SIZED:
+        return
+    ratio, name, size = sized[len(sized) // 2]
+    if not 1 / MOST_SIZE_RATIO <= ratio <= MOST_SIZE_RATIO:
         yield Finding(
             "depth_unit",
-            problem,
+            f"Objects are {ratio:.2g} times as large as usual: a {name} of {size:.2g} m.",
             "Depth is in another unit than expected.",
-            "Set `inputs.depth_scale` to the metres per unit of the depth image (0.001 = mm, "
-            "0.0001 = 0.1 mm, 0.0002 = TUM).",
+            SCALE_REMEDY,
         )
-
-
-def _factors(seen: Observations) -> list[str]:
-    """The factor of depth that fits the poses much better than the depth as it is, if there is."""
-    fits = {} if seen.checks is None else seen.checks.fits
-    found = [
-        (fit, name[len(FACTOR) :])
-        for name, fit in fits.items()
-        if name.startswith(FACTOR) and fit > max(fits[GIVEN], fits.get(STILL, 0.0)) + MIN_FIT_GAIN
-    ]
-    return [name for _, name in sorted(found, reverse=True)]
 
 
 def _registration(seen: Observations) -> Iterator[Finding]:
@@ -288,8 +479,7 @@ def _registration(seen: Observations) -> Iterator[Finding]:
             f"The edges of depth are about {np.hypot(u, v):.0f} pixels away from those of colour "
             f"({u:+.0f} columns, {v:+.0f} rows).",
             "Depth is not registered to colour, or the intrinsics are those of another stream.",
-            "Use the registered depth of the driver (aligned_depth_to_color of a RealSense, "
-            "depth_registered of OpenNI).",
+            REGISTER_REMEDY,
         )
 
 
@@ -308,6 +498,12 @@ POSES = {
         "Publish the transform to the optical frame in TF, or poses of the optical frame (z "
         "forward, x right).",
     ),
+    OPENGL: (
+        "poses_of_opengl",
+        "The images fit the poses much better if y is taken as up, and z as backward.",
+        "The poses are those of a camera of OpenGL, ARKit or Blender, and not of ROS.",
+        "Turn them: T_world_optical = T_world_camera · diag(1, -1, -1, 1).",
+    ),
     INVERSE: (
         "poses_inverted",
         "The images fit the inverse of the poses much better.",
@@ -315,29 +511,6 @@ POSES = {
         "Publish their inverse: the pose of the camera in the world.",
     ),
 }
-
-
-def _poses(seen: Observations) -> Iterator[Finding]:
-    fits = {} if seen.checks is None else seen.checks.fits
-    others = {name: fit for name, fit in fits.items() if name != GIVEN and FACTOR not in name}
-    if not others or _factors(seen):
-        return
-    best = max(others, key=lambda name: others[name])
-    if others[best] < fits[GIVEN] + MIN_FIT_GAIN:
-        if fits[GIVEN] < MIN_FIT:
-            yield Finding(*POSES[STILL])
-        return
-    if best in POSES:
-        yield Finding(*POSES[best])
-        return
-    delay_s = float(best[len(LATE) :])
-    yield Finding(
-        "late_poses",
-        f"The images fit the poses much better {abs(delay_s):g} s "
-        f"{'later' if delay_s > 0 else 'earlier'}.",
-        "The stamps of the poses are those of their arrival, or the clocks differ.",
-        "Stamp poses with the time at which the camera was there, and synchronise the clocks.",
-    )
 
 
 def _turned(seen: Observations) -> Iterator[Finding]:
@@ -352,6 +525,22 @@ def _turned(seen: Observations) -> Iterator[Finding]:
             "The images were turned upright for the detector; nothing has to be done.",
             harmless=True,
         )
+
+
+def _up(seen: Observations) -> Iterator[Finding]:
+    if not seen.up_world or seen.up_world[2] > NEARLY_UP:
+        return
+    axis = int(np.argmax(np.abs(seen.up_world)))
+    nearest = "xyz"[axis] if seen.up_world[axis] > 0 else f"-{'xyz'[axis]}"
+    values = ", ".join(f"{value:.2f}" for value in seen.up_world)
+    yield Finding(
+        "other_up",
+        f"Up was taken from the poses: ({values}), and not +z.",
+        "The world frame is not that of ROS, or the camera was held on its side.",
+        f"Nothing has to be done if that is up; else set `inputs.world_up` ({nearest} is the "
+        "nearest axis).",
+        harmless=True,
+    )
 
 
 def _detector(seen: Observations) -> Iterator[Finding]:
@@ -394,7 +583,7 @@ def _looks(seen: Observations) -> Iterator[Finding]:
             "Existence, class and size of an object need several looks at it.",
             "Record for some seconds.",
         )
-    elif checks is not None and checks.travel_m < STILL_M and checks.turn_deg < STILL_DEG:
+    elif checks is not None and _stands(checks):
         yield Finding(
             "still_camera",
             f"The camera stands still ({100 * checks.travel_m:.0f} cm, {checks.turn_deg:.0f} "
@@ -402,11 +591,11 @@ def _looks(seen: Observations) -> Iterator[Finding]:
             "Equal images count as one look, and sizes are those of the visible side.",
             "Move the camera around the objects.",
         )
-    elif hidden > (seen.nodes or 0):
+    elif hidden and not seen.nodes:
         reasons = ", ".join(f"{count} {reason}" for reason, count in seen.hidden.items())
         yield Finding(
             "few_looks",
-            f"More objects are hidden than published: {here} ({reasons}).",
+            f"No object is sure enough: {here} ({reasons}).",
             "They were seen too rarely, or the detector missed them in most frames.",
             "Look at them longer and from several sides, or set `output.min_existence` to 0 to see "
             "all of them.",
@@ -419,11 +608,14 @@ CHECKS: tuple[Check, ...] = (
     _clock,
     _missing,
     _losses,
+    _headers,
     _drops,
-    _depth,
+    _motion,
     _registration,
-    _poses,
+    _depth,
+    _sizes,
     _turned,
+    _up,
     _detector,
     _unused,
     _looks,

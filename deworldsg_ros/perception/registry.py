@@ -151,7 +151,7 @@ def build_perception(
 
     Args:
         config: the section `perception`.
-        world_up: axis of the world frame that points up: auto, z, y or -y.
+        world_up: axis of the world frame that points up, or auto.
         detector: replaces the configured detector.
         overlapped: whether the detector shall take several frames at the same time, with one
             thread for each; if it can. It needs less processor time for each frame, but a single

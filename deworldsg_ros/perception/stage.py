@@ -374,7 +374,7 @@ class Perception:
     Args:
         detector, segmenter, relation_head: the backends.
         config: the section `perception`.
-        world_up: axis of the world frame that points up: auto, z, y or -y (`UpEstimator`).
+        world_up: axis of the world frame that points up, or auto (`UpEstimator`).
         embedder: embeds some objects of each frame, in place of the detector's own embeddings.
         detectors: frames that `detect` can take at the same time, in other threads than that of
             `perceive`; 0 = it runs in the thread of `perceive` alone.

@@ -389,6 +389,7 @@ def observations_of(
         drops=drops,
         hidden=hidden,
         examples=examples,
+        remedies=REASONS,
         classes=classes,
         turns=turns,
         missing=tuple(dict.fromkeys(missing)),

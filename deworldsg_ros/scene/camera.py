@@ -321,7 +321,14 @@ def interpolate_pose(T_a: Float64, T_b: Float64, fraction: float) -> Float64:
 
 # --- The up direction of the world frame, from the poses of the camera.
 
-AXES = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
+AXES = {
+    "x": (1.0, 0.0, 0.0),
+    "-x": (-1.0, 0.0, 0.0),
+    "y": (0.0, 1.0, 0.0),
+    "-y": (0.0, -1.0, 0.0),
+    "z": (0.0, 0.0, 1.0),
+    "-z": (0.0, 0.0, -1.0),
+}
 
 MAX_POSES = 2**52
 

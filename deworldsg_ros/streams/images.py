@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import array
+import contextlib
 import re
 import sys
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.doctor.frame_checks import Header
 from deworldsg_ros.scene.arrays import Float32, UInt8, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
@@ -135,6 +138,7 @@ LAYOUTS: dict[str, tuple[str, int]] = {
 }
 RGB_ENCODINGS = ("rgb8", "bgr8", "rgba8", "bgra8", "mono8")
 DEPTH_ENCODINGS = ("16UC1", "mono16", "32FC1")
+MILLIMETRE_M = 1e-3
 
 _TO_RGB = {
     "bgr8": cv2.COLOR_BGR2RGB,
@@ -211,9 +215,9 @@ def depth_from_message(message: Any, *, depth_scale_m: float, max_depth_m: float
     NaN, infinity, negative values and values above `max_depth_m` become 0.
 
     Args:
-        message: 16UC1 or mono16 in units of `depth_scale_m`, 32FC1 in metres, or compressedDepth
-            of either.
-        depth_scale_m: metres per unit of a 16-bit image.
+        message: 16UC1, mono16, 32FC1, or compressedDepth of them.
+        depth_scale_m: metres per unit; 0 = by the encoding: millimetres in 16 bits, metres in
+            floats (REP 118).
         max_depth_m: largest valid depth.
 
     Raises:
@@ -226,8 +230,8 @@ def depth_from_message(message: Any, *, depth_scale_m: float, max_depth_m: float
     else:
         raw = image_view(message, DEPTH_ENCODINGS)
     depth_m: Float32 = raw.astype(np.float32)
-    if raw.dtype.kind == "u":
-        depth_m *= np.float32(depth_scale_m)
+    if depth_scale_m or raw.dtype.kind == "u":
+        depth_m *= np.float32(depth_scale_m or MILLIMETRE_M)
     # Also if the limit is infinite, or too large for float32.
     limit_m = np.float32(min(max_depth_m, float(np.finfo(np.float32).max)))
     # The negated comparison also catches NaN.
@@ -323,3 +327,45 @@ def _grey16(pixels: NDArray[Any], description: str) -> NDArray[Any]:
             "expected 16-bit grey",
         )
     return pixels
+
+
+# --- What the first messages of a camera say, for the doctor.
+
+
+def header_of(
+    topic: str, message: Any, camera_info: Any = None, depth_scale_m: float | None = None
+) -> Header:
+    """What a message of a camera says about itself.
+
+    Args:
+        topic: its name.
+        message: an image or a camera_info.
+        camera_info: of a depth image, that beside it; None = there is none.
+        depth_scale_m: of a depth image; None = it is none.
+    """
+    header = Header(topic, message.header.frame_id.lstrip("/"))
+    with contextlib.suppress(RefusedInput):  # it is counted where frames are made
+        if hasattr(message, "encoding"):
+            size, encoding = (int(message.width), int(message.height)), str(message.encoding)
+            header = replace(header, size=size, encoding=encoding)
+        elif is_compressed(message):
+            header = replace(header, encoding=str(message.format))
+        else:
+            header = replace(header, intrinsics=intrinsics_from_message(message))
+        if camera_info is not None:
+            header = replace(header, intrinsics=intrinsics_from_message(camera_info))
+        if depth_scale_m is not None:
+            depth_m = depth_from_message(
+                message, depth_scale_m=depth_scale_m, max_depth_m=float("inf")
+            )
+            valid = depth_m[depth_m > 0]
+            header = replace(header, middle_m=float(np.median(valid)) if len(valid) else None)
+    return header
+
+
+def info_topic(depth_topic: str) -> str:
+    """The topic of the camera_info beside depth images, also beside compressed ones."""
+    parts = depth_topic.split("/")
+    if parts[-1] in ("compressed", "compressedDepth"):
+        parts.pop()
+    return "/".join([*parts[:-1], "camera_info"])

@@ -25,7 +25,7 @@ def checks(with_depth=0.9, **more):
 
 def fits(change, fit, **more):
     """How well the frames fit with poses or depth that are changed so."""
-    return checks(fits={"given": 0.5, change: fit, **more})
+    return checks(fits={"given": 0.5, change: fit, **more}, travel_m=2.0)
 
 
 def few(frames, nodes, detections, **more):
@@ -82,7 +82,8 @@ ALL_IS_WELL = {
             "still_camera",
             "Move the camera",
         ),
-        (few(40, 1, 99, hidden={"missed": 3}, checks=GOOD), "few_looks", "3 missed"),
+        (few(40, 0, 99, hidden={"missed": 3}, checks=GOOD), "few_looks", "3 missed"),
+        (few(40, 1, 99, hidden={"missed": 3}, checks=GOOD), None, ""),
     ],
 )
 def test_observations_become_findings(seen, code, words):

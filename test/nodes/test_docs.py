@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "test")]
 
-from support import abnormal  # noqa: E402
+from support import abnormal, wrong_recordings  # noqa: E402
 
 from deworldsg_ros.ros import options  # noqa: E402
 from deworldsg_ros.ros.health import REASONS  # noqa: E402
@@ -51,6 +51,7 @@ def with_tables(text: str) -> str:
     tables = {
         "reasons": reasons_table(),
         "abnormal": abnormal.table(),
+        "matrix": wrong_recordings.table(),
         "parameters": parameters_table(options.Parameters),
         "viewer": parameters_table(options.ViewerParameters, "node"),
         "region": parameters_table(options.RegionParameters),

@@ -73,6 +73,20 @@ def test_a_colour_topic_is_no_depth_topic(tmp_path, compressed):
         open_recording(bag, topics=TopicChoice(depth=color))
 
 
+@pytest.mark.parametrize("compressed", [True, False])
+def test_depth_is_known_by_its_encoding(tmp_path, compressed):
+    """The driver of an OAK publishes depth on /oak/stereo/image_raw."""
+    renamed = [
+        (topic.replace("/camera/depth", "/oak/stereo").replace("/color", "/rgb"), *rest)
+        for topic, *rest in camera_items(2, compressed=compressed)
+    ]
+    with closing(open_recording(write_bag(tmp_path / "bag", renamed))) as recording:
+        topics = recording.source.topics
+        assert topics[Role.DEPTH].name.startswith("/oak/stereo/image_raw")
+        assert topics[Role.RGB].name.startswith("/camera/rgb/image_raw")
+        assert len(list(recording.frames())) == 2
+
+
 # --- poses -------------------------------------------------------------------------------------
 
 T_BASE_CAMERA = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0.2], [0, -1, 0, 0.3], [0, 0, 0, 1]])

@@ -29,7 +29,7 @@ METRES = COUNTS.astype(np.float32) * np.float32(0.001)
 
 
 def depth_of(message: SimpleNamespace, max_depth_m: float = 10.0) -> np.ndarray:
-    return depth_from_message(message, depth_scale_m=0.001, max_depth_m=max_depth_m)
+    return depth_from_message(message, depth_scale_m=0.0, max_depth_m=max_depth_m)
 
 
 @pytest.mark.parametrize(
@@ -97,6 +97,13 @@ def test_fill_image_takes_strided_pixels_and_refuses_another_type():
 )
 def test_depth_is_in_metres(message):
     np.testing.assert_array_equal(depth_of(message), METRES)
+
+
+@pytest.mark.parametrize(("pixels", "encoding"), [(COUNTS, "16UC1"), (COUNTS * 1.0, "32FC1")])
+def test_a_scale_is_that_of_every_encoding(pixels, encoding):
+    message = image(pixels.astype("f4") if encoding == "32FC1" else pixels, encoding)
+    depth_m = depth_from_message(message, depth_scale_m=0.0005, max_depth_m=10.0)
+    np.testing.assert_allclose(depth_m, METRES / 2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("limit_m", [10.0, np.inf, 1e39])

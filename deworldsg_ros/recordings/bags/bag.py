@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from deworldsg_ros.config import InputsConfig
+from deworldsg_ros.doctor.frame_checks import Header
 from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage, Topic
 from deworldsg_ros.recordings.bags.topics import TopicChoice, find_topics
 from deworldsg_ros.recordings.source import (
@@ -32,7 +33,12 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RecordingError, RefusedInput
 from deworldsg_ros.streams.detections import read_detections
-from deworldsg_ros.streams.images import depth_from_message, rgb_from_message
+from deworldsg_ros.streams.images import (
+    depth_from_message,
+    header_of,
+    info_topic,
+    rgb_from_message,
+)
 from deworldsg_ros.streams.poses import TransformTree, pose_from_message
 from deworldsg_ros.wire.messages import encode, ns_from_stamp
 
@@ -83,6 +89,7 @@ class BagSource:
                 self._inputs,
                 need_pose=need_pose,
                 need_camera_info=intrinsics is None,
+                encoding=self._encoding,
             )
             self._check_depth(found[Role.DEPTH])
             self._T_child_camera = self._mounting(found, choice)
@@ -154,9 +161,28 @@ class BagSource:
                 continue
             yield RoleMessage(raw.role, raw.msgtype, raw.stamp_ns, message)
 
+    def headers(self) -> dict[str, Header]:
+        """What the first messages of the camera say, by role."""
+        headers: dict[str, Header] = {}
+        for role in (Role.RGB, Role.DEPTH, Role.CAMERA_INFO):
+            message = self._first(self._found[role]) if role in self._found else None
+            if message is not None:
+                info, scale = None, None
+                if role is Role.DEPTH:
+                    info, scale = self._info_beside(), self._inputs.depth_scale
+                name = self._found[role].name
+                headers[role.value] = header_of(name, message, info, scale)
+        return headers
+
     def close(self) -> None:
         """Close the files."""
         self._bag.close()
+
+    def _info_beside(self) -> Any:
+        """The first camera_info beside the depth images; None if there is none."""
+        name = info_topic(self._found[Role.DEPTH].name)
+        beside = [t for t in self._bag.topics if (t.name, t.msgtype) == (name, CAMERA_INFO)]
+        return self._first(beside[0]) if beside else None
 
     def _mounting(self, found: dict[Role, Topic], choice: TopicChoice) -> Float64 | None:
         """T_child_camera (4, 4) for an odometry of another frame than the camera's, else None.
@@ -201,7 +227,7 @@ class BagSource:
         image = self._first(topic)
         try:
             if image is not None:
-                depth_from_message(image, depth_scale_m=1e-3, max_depth_m=1.0)
+                depth_from_message(image, depth_scale_m=0.0, max_depth_m=1.0)
         except RefusedInput as refusal:
             if refusal.reason == "not_depth":
                 raise RecordingError(
@@ -222,6 +248,11 @@ class BagSource:
                 f"recording {self.name}: --intrinsics needs the size of the images, and the first "
                 f"on {topic.name} cannot be read ({error})"
             ) from error
+
+    def _encoding(self, topic: Topic) -> str:
+        """Encoding of the first image of a topic; empty if it cannot be read."""
+        message = self._first(topic)
+        return "" if message is None else header_of(topic.name, message).encoding
 
     def _first(self, topic: Topic) -> Any:
         """The first message that can be decoded; None if there is none."""

@@ -30,6 +30,8 @@ TRANSPORT_SUFFIXES = {
     Role.RGB: ("", "/compressed"),
     Role.DEPTH: ("", "/compressedDepth", "/compressed"),
 }
+# Encodings that only depth has.
+DEPTHS = ("16UC1", "32FC1")
 # In order of preference.
 POSES = (POSE_STAMPED, ODOMETRY, TF_MESSAGE)
 # Names of images that are neither colour nor depth.
@@ -56,7 +58,7 @@ POSE_SOURCES: dict[str, Types] = {
 }
 EXPECTED = {
     Role.RGB: "an Image or CompressedImage with rgb, color or image in its name",
-    Role.DEPTH: "an Image or CompressedImage with depth in its name",
+    Role.DEPTH: "an Image or CompressedImage with depth in its name, or of 16UC1 or 32FC1",
     Role.CAMERA_INFO: "a CameraInfo beside the RGB image (or use --intrinsics FX,FY,CX,CY)",
     Role.POSE: "a PoseStamped, an Odometry or /tf (or use --odometry, or run with --poses FILE)",
     Role.DETECTIONS: "a Detection2DArray, or a String of ours with detections in its name",
@@ -102,6 +104,7 @@ def find_topics(
     *,
     need_pose: bool = True,
     need_camera_info: bool = True,
+    encoding: Callable[[Topic], str] = lambda _: "",
 ) -> dict[Role, Topic]:
     """The topic of each role.
 
@@ -112,6 +115,7 @@ def find_topics(
         inputs: ``transport`` and ``pose_source`` select the types.
         need_pose: whether a bag without poses is refused; if not, the role may be missing.
         need_camera_info: whether the role is looked for.
+        encoding: of the first image of a topic. It is asked if no name has the word depth.
 
     Raises:
         RecordingError: names the role, the topics seen and the expected type and name.
@@ -123,11 +127,17 @@ def find_topics(
     def find(role: Role, chosen: str, types: Types, score: Score) -> Topic:
         return _find(role, filled, chosen, types, score, recording)
 
-    rgb = find(Role.RGB, choice.rgb, images, _rgb_score)
-    found = {
-        Role.RGB: rgb,
-        Role.DEPTH: find(Role.DEPTH, choice.depth, images, _depth_score),
-    }
+    unnamed: list[Topic] = []
+    if not choice.depth and all(_depth_score(topic) is None for topic in filled):
+        unnamed = [t for t in filled if t.msgtype in images and encoding(t).startswith(DEPTHS)]
+    rgb = find(
+        Role.RGB,
+        choice.rgb,
+        images,
+        lambda topic: None if topic in unnamed else _rgb_score(topic),
+    )
+    depth = choice.depth or (max(unnamed, key=_plain).name if unnamed else "")
+    found = {Role.RGB: rgb, Role.DEPTH: find(Role.DEPTH, depth, images, _depth_score)}
     if need_camera_info:
         found[Role.CAMERA_INFO] = find(
             Role.CAMERA_INFO,
