@@ -25,6 +25,7 @@ from deworldsg_ros.client.combine import combine
 from deworldsg_ros.client.explain import place_of
 from deworldsg_ros.client.export import FORMATS
 from deworldsg_ros.client.export import export as export_graph
+from deworldsg_ros.client.goals import Robot
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.mcp_server import WatchedFile, make_server
 from deworldsg_ros.client.objects import SURE, odds_of
@@ -76,6 +77,13 @@ def goal(
     distance: Annotated[
         float, typer.Option("--distance", help="from the box of the object, metres")
     ] = 1.0,
+    radius: Annotated[
+        float, typer.Option("--radius", help="half of the robot's width, metres")
+    ] = Robot.radius_m,
+    height: Annotated[
+        float,
+        typer.Option("--height", help="of the robot, metres; higher boxes are not in its way"),
+    ] = Robot.height_m,
     live: Live = False,
     namespace: Namespace = "",
     as_json: AsJson = False,
@@ -84,15 +92,16 @@ def goal(
 
     The words are the id of an object or its class.
     """
+    robot = Robot(radius, height)
     if live:
         from deworldsg_ros.client import SceneGraphClient
 
         with SceneGraphClient(namespace) as client:
             client.wait(timeout_s=10.0)
-            found = client.goal_near(_which(words), distance)
+            found = client.goal_near(_which(words), distance, robot)
     else:
         with _opened(words, live, namespace) as (graph, rest):
-            found = graph.goal_near(_which(rest), distance).to_dict()
+            found = graph.goal_near(_which(rest), distance, robot=robot).to_dict()
     if as_json:
         print_json(found)
     else:
@@ -103,14 +112,15 @@ def _goal_lines(found: dict[str, Any]) -> list[str]:
     """The fields of `Goal.to_dict` in words."""
     x, y, z = found["pose"]["position"].values()
     target, clearance_m, seen_free = (found[key] for key in ("target", "clearance_m", "seen_free"))
+    blocker = found["blocked_by"]
     probability = found["target_probability"]
     return [
         f"stand at {x:.2f} {y:.2f} {z:.2f} in frame '{found['header']['frame_id']}', facing "
         f"{target['label']} #{target['id']} ({probability:.0%}"
         f"{'' if probability >= SURE else ', not sure'}); quaternion xyzw "
         + " ".join(f"{value:.4f}" for value in found["pose"]["orientation"].values()),
-        f"{found['distance_m']:.2f} m from it; "
-        + ("" if clearance_m is None else f"next object {clearance_m:.2f} m away; ")
+        f"{found['distance_m']:.2f} m from its box; "
+        + ("" if clearance_m is None else f"next object {clearance_m:.2f} m beside the robot; ")
         + f"it extends {found['along_std_m']:.2f} m (1σ) along, "
         f"{found['across_std_m']:.2f} m across the view",
         "not sure: walls are not known here"
@@ -119,8 +129,8 @@ def _goal_lines(found: dict[str, Any]) -> list[str]:
         *([] if found["in_known_area"] else ["not sure: the pose is outside of all objects"]),
         *(
             []
-            if found["blocked_by"] is None
-            else [f"not sure: object #{found['blocked_by']} may hide it"]
+            if blocker is None
+            else [f"not sure: {blocker['label']} #{blocker['id']} may hide it"]
         ),
     ]
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from deworldsg_ros.client.changes import Changes, Pairing
 from deworldsg_ros.client.explain import Explanation
-from deworldsg_ros.client.goals import Goal
+from deworldsg_ros.client.goals import Goal, Robot
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import HiddenObject, Relation, SceneObject
 from deworldsg_ros.scene.errors import ClientError
@@ -25,6 +25,7 @@ __all__ = [
     "HiddenObject",
     "Pairing",
     "Relation",
+    "Robot",
     "SceneGraph",
     "SceneGraphClient",
     "SceneObject",

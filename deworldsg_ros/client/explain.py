@@ -71,17 +71,17 @@ def explain_object(
     """
     frames, seconds = item.observations, (item.last_seen_ns - item.first_seen_ns) / 1e9
     lines = [f"detected in {counted(frames, 'frame')} over {seconds:.1f} s", *_frame_lines(seen)]
-    if item.existence is not None:
-        lines.append(f"exists with {item.existence:.0%} ({odds_of(item.existence)})")
     names = ", ".join(f"{belief.label} {belief.probability:.0%}" for belief in item.classes[:3])
+    what = f"is a {item.label}" if item.is_named else "is an object without a name"
+    sure = "" if item.is_sure else ": not sure"
+    lines.append(f"{what} with {item.probability:.0%} ({odds_of(item.probability)}){sure}")
+    if item.existence is not None:
+        lines.append(f"exists with {item.existence:.0%}")
     if item.is_labelled_by_hand:
-        lines.append(f"class: {item.label}, set by the operator")
+        lines.append(f"{item.label}: set by the operator")
     else:
-        kind = "class" if item.is_named else "no class is probable enough for a name"
+        kind = "if it exists" if item.is_named else "no class is probable enough for a name"
         lines.append(f"{kind}: {names}; all others {item.other_classes:.0%}")
-    if not item.is_sure:
-        what = f"it is a {item.label}" if item.is_named else "there is an object"
-        lines.append(f"not sure: {what} with {item.probability:.0%} in all")
     looks = f"{len(item.surface_m)} surface points" if len(item.surface_m) else "no surface points"
     size = " x ".join(item.size_words)
     lines.append(f"box {size} cm, from the {item.box_source}; {looks} in this message")

@@ -21,14 +21,34 @@ from deworldsg_ros.scene.errors import ClientError
 DIRECTIONS = 72
 # Farther away, no camera sees an object of a room.
 MAX_DISTANCE_M = 10.0
-# Half the width of a robot, and its height. A box above the robot is not in its way.
-ROBOT_RADIUS_M, ROBOT_HEIGHT_M = 0.3, 1.5
+# No robot that this is for is larger.
+MAX_RADIUS_M, MAX_HEIGHT_M = 5.0, 10.0
 # Heights above the floor at which the seen space is looked at; below, the floor itself is seen.
 LOWEST_M, HEIGHT_STEP_M = 0.2, 0.3
 # Something is at a spot if more than this share of the robot's volume was seen as occupied.
 MAX_OCCUPIED = 0.05
 # The floor is this quantile of the bottoms of all boxes: few objects seem to be below it.
 FLOOR_QUANTILE = 0.05
+
+
+@dataclass(frozen=True)
+class Robot:
+    """The robot, or the person, that is to stand there; ClientError for impossible sizes.
+
+    Attributes:
+        radius_m: half of its width.
+        height_m: its height. A box above it is not in its way.
+    """
+
+    radius_m: float = 0.3
+    height_m: float = 1.5
+
+    def __post_init__(self) -> None:
+        if not 0 < self.radius_m <= MAX_RADIUS_M or not 0 < self.height_m <= MAX_HEIGHT_M:
+            raise ClientError(
+                f"radius {self.radius_m} and height {self.height_m} of the robot: expected "
+                f"positive metres, at most {MAX_RADIUS_M:g} and {MAX_HEIGHT_M:g}"
+            )
 
 
 @dataclass(frozen=True)
@@ -42,7 +62,8 @@ class Goal:
         frame_id: the world frame.
         stamp_ns: of the graph.
         distance_m: horizontal distance from the box of the object.
-        clearance_m: gap to the nearest other box that is as low as the robot; infinite without one.
+        clearance_m: gap from the edge of the robot to the nearest other box that is as low as the
+            robot; infinite without one.
         seen_share: share of the object's surface points on this side, 0.5 = no difference. The
             camera was on the side of the visible surface, so this side was free of walls.
         covariance_m2: covariance (3, 3) of the object's Gaussian.
@@ -86,7 +107,9 @@ class Goal:
             "along_std_m": round(self.along_std_m, 3),
             "across_std_m": round(self.across_std_m, 3),
             "bearing_std_deg": round(math.degrees(self.bearing_std_rad), 1),
-            "blocked_by": None if self.blocked_by is None else self.blocked_by.id,
+            "blocked_by": None
+            if self.blocked_by is None
+            else {"id": self.blocked_by.id, "label": self.blocked_by.label},
             "in_known_area": self.in_known_area,
             "seen_free": None if self.seen_free is None else round(self.seen_free, 2),
         }
@@ -113,7 +136,7 @@ def goal_near(
     distance: float,
     stamp_ns: int,
     *,
-    radius: float = ROBOT_RADIUS_M,
+    robot: Robot = Robot(),
     towards: Point | None = None,
     space: SeenSpace | None = None,
 ) -> Goal:
@@ -130,7 +153,7 @@ def goal_near(
         others: the other objects of the graph; the target itself is skipped.
         distance: horizontal distance from its box, metres.
         stamp_ns: of the graph.
-        radius: of the robot, metres.
+        robot: that is to stand there.
         towards: preferred position, e.g. where the robot is.
         space: what the camera has seen as free; None = not known.
 
@@ -143,15 +166,15 @@ def goal_near(
         )
     obstacles = [item for item in others if item.id != target.id]
     floor = floor_m([target, *obstacles])
-    low = [item for item in obstacles if item.footprint.low < floor + ROBOT_HEIGHT_M]
+    low = [item for item in obstacles if item.footprint.low < floor + robot.height_m]
     area = _hull(np.concatenate([item.footprint.corners for item in [target, *obstacles]]))
     boxes = np.array([item.footprint.corners for item in low]).reshape(-1, 4, 2)
     best: tuple[float, Goal] | None = None
     rays = _rays()
     spots = np.array([_spot(target.footprint, ray, distance) for ray in rays])
-    shares = _seen_free(space, target, spots, floor, radius)
+    shares = _seen_free(space, target, spots, floor, robot)
     for ray, spot, seen_free in zip(rays, spots, shares):
-        clearance = float(point_gaps_m(spot, boxes).min(initial=math.inf)) - radius
+        clearance = float(point_gaps_m(spot, boxes).min(initial=math.inf)) - robot.radius_m
         if clearance <= 0.0:
             continue
         if seen_free is not None and seen_free < 0.0:
@@ -166,7 +189,7 @@ def goal_near(
     if best is None:
         raise ClientError(
             f"no free side of {target.name} at {distance:g} m: other objects are within "
-            f"{radius:g} m of every pose; try another distance"
+            f"{robot.radius_m:g} m of every pose; try another distance, or a smaller radius"
         )
     return best[1]
 
@@ -218,13 +241,14 @@ def free_direction(
 
 
 def _seen_free(
-    space: SeenSpace | None, target: SceneObject, spots: Float64, floor: float, radius: float
+    space: SeenSpace | None, target: SceneObject, spots: Float64, floor: float, robot: Robot
 ) -> list[float | None]:
     """Share of the robot's volume at each spot that was seen as free; -1 = something is there."""
     if space is None or not len(space):
         return [None] * len(spots)
-    disc = np.concatenate([np.zeros((1, 2)), radius * _rays()[::9]])
-    heights = floor + np.arange(LOWEST_M, ROBOT_HEIGHT_M, HEIGHT_STEP_M)
+    disc = np.concatenate([np.zeros((1, 2)), robot.radius_m * _rays()[::9]])
+    lowest_m = min(LOWEST_M, robot.height_m / 2.0)
+    heights = floor + np.arange(lowest_m, robot.height_m, HEIGHT_STEP_M)
     plan = np.repeat((spots[:, None] + disc).reshape(-1, 2), len(heights), axis=0)
     levels = np.tile(heights, len(spots) * len(disc))
     volume = np.column_stack([plan, levels]) @ horizontal_axes(target.up)

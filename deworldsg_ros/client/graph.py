@@ -25,7 +25,7 @@ from deworldsg_ros.client.explain import (
     explain_relation,
     place_of,
 )
-from deworldsg_ros.client.goals import ROBOT_RADIUS_M, Goal, free_direction, goal_near
+from deworldsg_ros.client.goals import Goal, Robot, free_direction, goal_near
 from deworldsg_ros.client.meanings import (
     KNOWN,
     is_called,
@@ -531,14 +531,14 @@ class SceneGraph:
         of: Which,
         distance: float = 1.0,
         *,
-        radius: float = ROBOT_RADIUS_M,
+        robot: Robot = Robot(),
         towards: Point | None = None,
         space: SeenSpace | None = None,
     ) -> Goal:
         """A pose from which an object is in view; see `goals.goal_near`."""
         target, seen = self.one(of), space or self.space
         return goal_near(
-            target, self, distance, self.stamp_ns, radius=radius, towards=towards, space=seen
+            target, self, distance, self.stamp_ns, robot=robot, towards=towards, space=seen
         )
 
     def take_embeddings(self, path: str | Path) -> None:

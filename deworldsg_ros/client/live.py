@@ -8,6 +8,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import rclpy
@@ -20,6 +21,7 @@ from std_srvs.srv import Trigger
 
 from deworldsg_ros.base.words import visible
 from deworldsg_ros.client.changes import Changes
+from deworldsg_ros.client.goals import Robot
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import Point
 from deworldsg_ros.graph.embeddings import Looks
@@ -31,6 +33,8 @@ from deworldsg_ros.wire.follow import MOST_WAITING, GraphFollower, GraphReplica
 TEXT_SERVICE, TRIGGER_SERVICE = AddDiagnostics, Trigger
 # Either of these nodes has the graph.
 NODES = ("graph_node", "deworldsg_node")
+# These publish a graph, too.
+OTHERS = ("fleet_node", "region_node")
 # The graph's thread may compile kernels, or write a large map.
 TIMEOUT_S = 60.0
 FIND_S = 10.0
@@ -215,7 +219,12 @@ class SceneGraphClient:
         assert graph is not None
         return graph
 
-    def goal_near(self, of: int | str, distance_m: float = 1.0) -> dict[str, Any]:
+    def goal_near(
+        self,
+        of: int | str,
+        distance_m: float = 1.0,
+        robot: Robot = Robot(),
+    ) -> dict[str, Any]:
         """A pose from which an object is in view, with the fields of `Goal.to_dict`.
 
         The node with the graph computes it and does not publish it: only this node has the depth
@@ -225,14 +234,17 @@ class SceneGraphClient:
         Args:
             of: id or class of the object.
             distance_m: horizontal distance from its box.
+            robot: that is to stand there.
 
         Raises:
             ClientError: if there is no such object, or no free side of it.
         """
         try:
-            return self.command("goal_near", object=of, distance_m=distance_m, publish=False)
+            return self.command(
+                "goal_near", object=of, distance_m=distance_m, publish=False, **asdict(robot)
+            )
         except NoService:
-            return self.graph.goal_near(of, distance_m).to_dict()
+            return self.graph.goal_near(of, distance_m, robot=robot).to_dict()
 
     def explain(self, what: int | str) -> dict[str, Any]:
         """Ask the node why an object is in its graph, or what it knows of a place.
@@ -418,6 +430,13 @@ class SceneGraphClient:
             raise ClientError(response.message)
         return str(response.message)
 
+    def _is_of_others(self) -> bool:
+        """Whether the graph is that of a fleet or a region: their nodes have no services."""
+        topic = f"{self._namespace}/scene_graph"
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        names = [info.node_name for info in publishers if info.node_name in OTHERS]
+        return bool(publishers) and len(names) == len(publishers)
+
     def _find(self, service: str) -> str:
         """The name of a service of the node with the graph."""
         end_s = time.monotonic() + FIND_S
@@ -428,6 +447,11 @@ class SceneGraphClient:
             found = [name for name in names if name in known]
             if found:
                 return found[0]
+            if self._is_of_others():
+                raise NoService(
+                    f"{self._namespace}/scene_graph is published by another node than "
+                    f"{' or '.join(NODES)}: it has no {service}"
+                )
             time.sleep(0.05)
         raise NoService(
             f"no service {' or '.join(names)} within {FIND_S:g} s: is graph_node running, and are "

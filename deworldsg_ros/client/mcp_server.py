@@ -12,6 +12,7 @@ from typing import Any
 from deworldsg_ros import __version__
 from deworldsg_ros.base.words import whole_number
 from deworldsg_ros.client.explain import place_of
+from deworldsg_ros.client.goals import Robot
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
 from deworldsg_ros.client.questions import ask
@@ -152,7 +153,13 @@ class GraphTools:
             )
         return answer
 
-    def goal_near(self, object: Named, distance_m: float = 1.0) -> dict[str, Any]:
+    def goal_near(
+        self,
+        object: Named,
+        distance_m: float = 1.0,
+        radius_m: float = Robot.radius_m,
+        height_m: float = Robot.height_m,
+    ) -> dict[str, Any]:
         """Give a pose on the floor from which an object is in view, for a navigation goal.
 
         `seen_free` is the share of the robot's volume there that was seen as free; null = walls are
@@ -161,13 +168,16 @@ class GraphTools:
         Args:
             object: id, or class.
             distance_m: from the box of the object, metres.
+            radius_m: half of the robot's width.
+            height_m: of the robot; what is higher is not in its way.
         """
         which = _which(object)
         if which is None:
             raise ClientError("object is empty: expected an id or a class")
+        robot = Robot(radius_m, height_m)
         if self._client is not None:
-            return dict(self._client.goal_near(which, distance_m))
-        return self._graph().goal_near(which, distance_m).to_dict()
+            return dict(self._client.goal_near(which, distance_m, robot))
+        return self._graph().goal_near(which, distance_m, robot=robot).to_dict()
 
     def _graph(self) -> SceneGraph:
         graph = self._newest()

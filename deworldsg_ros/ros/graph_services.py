@@ -21,7 +21,7 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from deworldsg_ros.base.files import parse_json
-from deworldsg_ros.client.goals import Goal
+from deworldsg_ros.client.goals import Goal, Robot
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.questions import ask
 from deworldsg_ros.graph.edits import DeleteNode, EditRequest, MergeNodes, SetLabel, SplitNode, Undo
@@ -60,6 +60,8 @@ class GoalNear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     object: int | Text
     distance_m: float = 1.0
+    radius_m: float = Robot.radius_m
+    height_m: float = Robot.height_m
     towards: Point | None = None
     publish: bool = True
 
@@ -213,8 +215,9 @@ class GraphServices:
         def answer() -> str:
             x, y, z = request.towards or (0.0, 0.0, 0.0)
             towards = None if request.towards is None else (x, y, z)
+            robot = Robot(request.radius_m, request.height_m)
             goal: Goal = graph.goal_near(
-                request.object, request.distance_m, towards=towards, space=space
+                request.object, request.distance_m, robot=robot, towards=towards, space=space
             )
             if request.publish:
                 self._publish_goal(goal.pose_stamped())

@@ -28,7 +28,8 @@ def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
     table = Table(
         title=_title("object", len(graph.nodes), most),
         caption=Text(
-            f"p: probability of the class; position in frame {graph.frame_id!r}; "
+            "p: it exists and is that; an object without a name: it exists; "
+            f"position in frame {graph.frame_id!r}; "
             "size: length, width and height; seen: number of frames"
         ),
     )
@@ -43,7 +44,7 @@ def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
         item = scene_object(node, graph.frame_id, up)
         table.add_row(
             _name(node.label, node.id, Style(color=colours[node.label])),
-            _percent(node.classes[0].probability) if node.classes and node.named else "",
+            _percent(item.probability),
             " ".join(f"{value:6.2f}" for value in item.position_m),
             " × ".join(item.size_words),
             str(node.observations),

@@ -1,6 +1,7 @@
 """Poses from which an object is in view, free directions, explanations and changes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.view import box_at, make_edge, make_graph, make_node
 
-from deworldsg_ros.client import ClientError, SceneGraph
+from deworldsg_ros.client import ClientError, Robot, SceneGraph
 from deworldsg_ros.client.boxes import footprint, gap_m, point_gaps_m, polygon_gap_m
 from deworldsg_ros.scene.camera import pose_from_quaternion
 from deworldsg_ros.wire import messages as wire
@@ -69,6 +70,30 @@ def test_a_goal_is_at_the_distance_faces_the_object_and_is_free(corner):
 def test_no_free_side(corner, distance, words):
     with pytest.raises(ClientError, match=words):
         corner.goal_near("cup", distance)
+
+
+def test_a_small_robot_goes_where_a_large_one_does_not(corner):
+    with pytest.raises(ClientError, match="smaller radius"):
+        corner.goal_near("cup", 0.9, robot=Robot(radius_m=2.0))
+    shop = graph_of(
+        boxed(1, "cup", (0, 0, 0.8), (0.1, 0.1, 0.1)),
+        boxed(2, "canopy", (0, 0, 1.0), (6.0, 6.0, 0.1)),
+        boxed(3, "rug", (9, 0, 0.005), (1.0, 1.0, 0.01)),
+    )
+    assert shop.goal_near("cup", 0.9, robot=Robot(height_m=0.2)).clearance_m > 0.0
+    with pytest.raises(ClientError, match="no free side"):
+        shop.goal_near("cup", 0.9)
+
+
+@pytest.mark.parametrize("size", [{"radius_m": 0.0}, {"radius_m": math.nan}, {"height_m": 11.0}])
+def test_no_robot_has_such_a_size(size):
+    with pytest.raises(ClientError, match="expected positive metres"):
+        Robot(**size)
+
+
+def test_the_object_in_the_way_has_a_name(corner):
+    goal = replace(corner.goal_near("cup", 0.9), blocked_by=corner[5])
+    assert goal.to_dict()["blocked_by"] == {"id": 5, "label": "chair"}
 
 
 def test_a_goal_as_a_message_for_nav2(corner):
@@ -144,9 +169,9 @@ def test_why(corner):
 
 def test_hidden_objects_tell_why_they_are_hidden(corner):
     message = make_graph(corner.message.nodes)
-    message.hidden = [wire.HiddenNode("lamp", [1.0, 2.0, 3.0], 0.3, 2, "seen too little")]
+    message.hidden = [wire.HiddenNode("shop", [1.0, 2.0, 3.0], 0.3, 2, "seen too little")]
     graph = SceneGraph(wire.decode(wire.encode(message), wire.SceneGraphMessage))
-    why = graph.explain("lamp")
+    why = graph.explain("shop")
     assert why.lines[0].startswith("hidden at 1.00 2.00 3.00: seen too little")
     assert why.values["hidden"][0]["reason"] == "seen too little"
     assert "never detected" in graph.explain("sofa").lines[-1]
@@ -157,7 +182,7 @@ def test_changes_between_sessions_are_found_by_place():
         boxed(1, "table", (0, 0, 0.4), (1, 1, 0.8)),
         boxed(2, "cup", (0, 0, 0.85), (0.1, 0.1, 0.1)),
         boxed(3, "chair", (2, 0, 0.4), (0.4, 0.4, 0.8)),
-        boxed(4, "lamp", (-4, 0, 1), (0.3, 0.3, 1)),
+        boxed(4, "shop", (-4, 0, 1), (0.3, 0.3, 1)),
         boxed(5, "vase", (4, 4, 1), (0.2, 0.2, 0.3)),
     )
     after = graph_of(

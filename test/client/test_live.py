@@ -1,6 +1,7 @@
 """The live client over DDS: the first graph, updates, a gap, changes, the end."""
 
 import threading
+import time
 from collections.abc import Callable
 
 import pytest
@@ -14,6 +15,7 @@ from support.reference_updates import diff
 from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.client import ClientError, SceneGraph, SceneGraphClient
+from deworldsg_ros.client.live import FIND_S
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.wire import messages as wire
 
@@ -153,6 +155,18 @@ def test_a_function_of_the_client_cannot_wait_for_it():
     assert refusals.pop() == "1 object"  # what has arrived needs no waiting
     assert len(refusals) == 3
     assert all("call this from another thread" in refusal for refusal in refusals)
+
+
+def test_a_fleet_has_no_services_and_nobody_waits_for_them():
+    with peer("fleet_node") as me, SceneGraphClient() as client:
+        Robot(me).latch(graph(1, "cup"))
+        client.wait(1, LIMIT_S)
+        start_s = time.monotonic()
+        assert client.goal_near("cup")["target"]["label"] == "cup"
+        assert client.explain("cup")["subject"].startswith("cup")
+        with pytest.raises(ClientError, match="is published by another node than graph_node"):
+            client.save()
+        assert time.monotonic() - start_s < FIND_S
 
 
 def test_closing_a_client_ends_those_who_wait_for_it():

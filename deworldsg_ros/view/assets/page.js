@@ -266,8 +266,9 @@ function showCard(id) {
     .map(([label, p]) => `${label} ${percent(p)}`);
   if (node.other >= 0.01) classes.push(`others ${percent(node.other)}`);
   for (const [term, text] of [
-    ["class", (node.named ? "" : "perhaps ") + classes.join(", ")],
-    ["is an object", node.existence === null ? null : percent(node.existence)],
+    [node.named ? `is a ${node.label}` : "is an object", percent(belief(node))],
+    ["exists", node.existence === null ? null : percent(node.existence)],
+    ["if it exists", (node.named ? "" : "perhaps ") + classes.join(", ")],
     ["size", `${node.sizeWords.join(" × ")} cm`],
     ["colour", node.looks],
     ["position", `${node.position.map(value => value.toFixed(2)).join(", ")} m`],

@@ -59,9 +59,10 @@ def object_html(item: SceneObject, relations: Sequence[Relation], photo: bytes |
     size = " × ".join(item.size_words)
     unseen = "; not seen to the end: ≥" if item.is_partly_seen else ""
     facts = {
-        "exists": ""
-        if item.existence is None
-        else f"{item.existence:.0%} ({odds_of(item.existence)})",
+        f"is a {item.label}" if item.is_named else "is an object": (
+            f"{item.probability:.0%} ({odds_of(item.probability)})"
+        ),
+        "exists": "" if item.existence is None else f"{item.existence:.0%}",
         "class": uncertainty(item),
         "looks": f"{counted(item.observations, 'frame')} over {seconds:.1f} s",
         "size": f"{size} cm (length, width, height{unseen})",
@@ -112,12 +113,13 @@ def _bars(item: SceneObject) -> str:
         for name, share in shares
         if share >= 0.005
     ]
-    return f'<table style="width:100%;margin:.3em 0">{"".join(rows)}</table>'
+    caption = f'<caption style="{MUTED};text-align:left">if it exists</caption>'
+    return f'<table style="width:100%;margin:.3em 0">{caption}{"".join(rows)}</table>'
 
 
 def _facts(facts: dict[str, str]) -> str:
     rows = [
-        f'<tr><td style="{MUTED};padding-right:.8em;vertical-align:top">{name}</td>'
+        f'<tr><td style="{MUTED};padding-right:.8em;vertical-align:top">{escape(name)}</td>'
         f"<td>{escape(text)}</td></tr>"
         for name, text in facts.items()
         if text
