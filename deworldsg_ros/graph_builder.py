@@ -110,8 +110,9 @@ class GraphBuilder:
         return dict(Counter(self.merging.hidden(self.graph).values()))
 
     def configure(self, config: Config) -> None:
-        """Use other thresholds of the sections ``merging`` and ``relations`` from now on."""
+        """Use other thresholds of merging, relations and publication from now on."""
         self.merging.configure(config.merging)
+        self.merging.publish_from(self.graph, config.output.min_existence)
         self._relations = config.relations
 
     def integrate(self, local: LocalGraph) -> list[int]:

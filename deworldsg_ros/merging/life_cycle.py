@@ -205,9 +205,16 @@ class LifeCycle:
         return {**reasons, **dict.fromkeys(edits.deleted, DELETED)}
 
     def publish_again(self, graph: GlobalGraph, node_ids: list[int]) -> None:
-        """Publish nodes that an edit has hidden, if they are likely to be objects."""
+        """Publish nodes that were hidden, if they are likely to be objects; hide the others."""
         existence = self._records.existence(graph.nodes.slots_of(node_ids))
         graph.set_existence(node_ids, existence, self._min_existence)
+
+    def publish_from(self, graph: GlobalGraph, min_existence: float) -> None:
+        """Use another least probability, also for the nodes that are known already."""
+        if min_existence != self._min_existence:
+            self._min_existence = min_existence
+            slot_of = graph.nodes.slot_of
+            self.publish_again(graph, [i for i in slot_of if self._records.has(slot_of[i])])
 
     def remove(self, graph: GlobalGraph, node_id: int) -> None:
         """Remove a node, wherever its object is."""

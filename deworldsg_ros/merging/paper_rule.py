@@ -184,6 +184,9 @@ class PaperMerging:
         self._bound = bhattacharyya_bound(config.hellinger_threshold)
         self._class_threshold = config.class_distance_threshold
 
+    def publish_from(self, graph: GlobalGraph, min_existence: float) -> None:
+        """Nothing: all nodes are published."""
+
     def warm_up(self) -> None:
         """Compile the kernels before the first frame."""
         warm_up()

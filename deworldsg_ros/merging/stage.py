@@ -27,6 +27,13 @@ class Merging(Protocol):
         """Use other thresholds from the next frame on; the rule stays."""
         ...
 
+    def publish_from(self, graph: GlobalGraph, min_existence: float) -> None:
+        """Publish the nodes that are objects with at least this probability, and hide the others.
+
+        The paper's rule publishes all nodes.
+        """
+        ...
+
     def merge(self, graph: GlobalGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph. All calls use the same graph.
 

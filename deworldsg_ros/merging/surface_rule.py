@@ -55,6 +55,10 @@ class SurfaceMerging:
         """Use another threshold from the next frame on."""
         self._config = config
 
+    def publish_from(self, graph: GlobalGraph, min_existence: float) -> None:
+        """Publish the nodes that are objects with at least this probability; hide the others."""
+        self._life_cycle.publish_from(graph, min_existence)
+
     def warm_up(self) -> None:
         """Compile the kernels before the first frame."""
         spare, graph = (

@@ -14,6 +14,7 @@ LIVE_GRAPH = (
     "merging.class_distance_threshold",
     "merging.overlap_threshold",
     "relations.geo_cost_threshold",
+    "output.min_existence",
     "output.rate_hz",
 )
 

@@ -314,3 +314,12 @@ def test_a_tentative_node_that_is_seen_through_is_removed(scene) -> None:
     scene.see((WHOLE, TABLE), (HERE, CUP), make=before_wall)
     scene.see((WHOLE, TABLE), make=before_wall, times=6)
     assert list(scene.graph.nodes.slot_of) == [1]
+
+
+def test_another_least_probability_publishes_and_hides_what_is_known(scene) -> None:
+    scene.see((WHOLE, TABLE), (ON_TABLE, CUP))
+    existence = scene.graph.nodes.existence[scene.graph.nodes.slots]
+    assert scene.published() == {} or existence.min() >= 0.5
+    for least in (0.0, 1.0, 0.5, float(existence.max()), 0.0):
+        scene.merging.publish_from(scene.graph, least)
+        assert len(scene.published()) == np.count_nonzero(existence >= least)
