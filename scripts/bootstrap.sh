@@ -22,23 +22,29 @@ fail() {
   exit 1
 }
 
-# quietly LABEL COMMAND...: run the command and show one line. Show its output only if it fails.
+newest_line() { tail -n 1 "$log" 2>/dev/null | tr -d '\r' | sed 's/^ *//' | cut -c 1-60; }
+
+# quietly LABEL COMMAND...: run the command and show one line, with the newest line of its output.
+# Without a terminal, a line every 15 s. Show the whole output only if the command fails.
 quietly() {
-  local label=$1 began=$SECONDS pid status=0 turn=0 spinner='-\|/'
+  local label=$1 began=$SECONDS pid status=0 turn=0 spinner='-\|/' line said=$SECONDS
   shift
   "$@" >"$log" 2>&1 </dev/null 9>&- &
   pid=$!
   trap 'kill "$pid" 2>/dev/null; say; fail "stopped; the next call continues here"' INT TERM
-  if [ -t 2 ]; then
-    while kill -0 "$pid" 2>/dev/null; do
-      printf '\r  %s %s … %d s ' "${spinner:turn % 4:1}" "$label" $((SECONDS - began)) >&2
+  [ -t 2 ] || say "  $label …"
+  while kill -0 "$pid" 2>/dev/null; do
+    if [ -t 2 ]; then
+      line="  ${spinner:turn % 4:1} $label … $((SECONDS - began)) s  $(newest_line)"
+      printf '\r\033[K%s' "${line:0:79}" >&2
       turn=$((turn + 1))
-      sleep 0.3
-    done
-    printf '\r\033[K' >&2
-  else
-    say "  $label …"
-  fi
+    elif [ $((SECONDS - said)) -ge 15 ]; then
+      said=$SECONDS
+      say "  $label … $((SECONDS - began)) s  $(newest_line)"
+    fi
+    sleep 0.3
+  done
+  [ ! -t 2 ] || printf '\r\033[K' >&2
   wait "$pid" || status=$?
   trap - INT TERM
   if [ "$status" -ne 0 ]; then

@@ -9,6 +9,7 @@ import json
 import cv2
 import numpy as np
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
@@ -44,4 +45,7 @@ class ExampleDetector(Node):
 
 if __name__ == "__main__":
     rclpy.init()
-    rclpy.spin(ExampleDetector())
+    try:
+        rclpy.spin(ExampleDetector())
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass  # Ctrl-C, or SIGTERM

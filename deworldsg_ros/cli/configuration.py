@@ -150,7 +150,7 @@ HEADER = """\
 # value. The sections follow the data: inputs, odometry, the four stages, output.
 # This is a ROS 2 parameter file: pass it to the nodes (--params-file) or to deworldsg (--config).
 # A file may contain a part of the options; the others keep their defaults.
-# Some thresholds and rates can be changed while a node runs (docs/dev/nodes.md). Nodes read all
+# Some thresholds and rates can be changed while a node runs (docs/on_a_robot.md). Nodes read all
 # others once, at start-up.
 """
 NO_BREAK = "\N{NO-BREAK SPACE}"

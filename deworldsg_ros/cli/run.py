@@ -11,7 +11,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -564,7 +564,10 @@ def compile_kernels(console: Console) -> None:
         ProcessPoolExecutor(processes, mp_context=context) as pool,
     ):
         try:
-            list(pool.map(_compile, PARTS))
+            parts = {pool.submit(_compile, part): part for part in PARTS}
+            for number, done in enumerate(as_completed(parts), 1):
+                done.result()
+                console.print(f"{number} of {len(PARTS)}: {parts[done]}", highlight=False)
         except Exception as error:  # numba can fail in more ways than can be listed
             text = "".join(traceback.format_exception(error))
             raise CompilationFailed(f"the kernels could not be compiled:\n{text}") from error

@@ -158,8 +158,9 @@ def test_a_function_of_the_client_cannot_wait_for_it():
 
 
 def test_a_fleet_has_no_services_and_nobody_waits_for_them():
-    with peer("fleet_node") as me, SceneGraphClient() as client:
-        Robot(me).latch(graph(1, "cup"))
+    # In a namespace of its own: a graph that somebody else publishes, too, is not the fleet's.
+    with peer("fleet_node") as me, SceneGraphClient("/fleet_1") as client:
+        Robot(me, "/fleet_1").latch(graph(1, "cup"))
         client.wait(1, LIMIT_S)
         start_s = time.monotonic()
         assert client.goal_near("cup")["target"]["label"] == "cup"

@@ -71,6 +71,17 @@ def test_the_tables_of_the_page_are_those_of_the_code(page):
     assert text == with_tables(text), "run: python test/nodes/test_docs.py"
 
 
+def test_the_page_for_robots_has_all_launch_arguments():
+    page = (DOCS / "on_a_robot.md").read_text(encoding="utf-8")
+    for path in sorted((ROOT / "launch").glob("*.py")):
+        text = path.read_text(encoding="utf-8")
+        inputs = re.findall(r'^    \(?\s*"(\w+)", ?"[\w/]+",', text, re.MULTILINE)
+        names = re.findall(r'DeclareLaunchArgument\(\s*"(\w+)"', text)
+        assert names
+        for name in (*names, *inputs):
+            assert f"`{name}`" in page, f"{path.name}: {name}"
+
+
 def literals(names: tuple[str, ...], places: dict[str, int]) -> Iterator[str]:
     """Texts in the calls of some functions, at the first place or another."""
     for name in names:

@@ -333,7 +333,7 @@ def test_another_node_on_the_topic_is_noticed(robot):
 
 
 def test_the_calls_in_the_documentation_work(robot, root_dir):
-    page = (root_dir / "docs" / "dev" / "nodes.md").read_text(encoding="utf-8")
+    page = (root_dir / "docs" / "on_a_robot.md").read_text(encoding="utf-8")
     calls = [shlex.split(line) for line in page.splitlines() if "service call" in line[:20]]
     assert len({call[3] for call in calls}) == 11
     kinds = {"std_srvs/srv/Trigger": Trigger, "diagnostic_msgs/srv/AddDiagnostics": AddDiagnostics}

@@ -17,7 +17,7 @@ DEV = ROOT / "docs" / "dev"
 # A changelog names files of earlier versions.
 HISTORY = {"CHANGELOG.md"}
 # A program of another project, and files that the package writes.
-ELSEWHERE = {"Merging/evaluate.py", "SCAN/config.yaml", "config.yaml"}
+ELSEWHERE = {"Merging/evaluate.py", "SCAN/config.yaml", "config.yaml", "my.yaml"}
 
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 HEADING = re.compile(r"^#+ +(.+)$", re.MULTILINE)
@@ -126,7 +126,6 @@ def test_the_site_has_all_pages_builds_strictly_and_fetches_nothing(root_dir, tm
     pytest.importorskip("mkdocs", reason="pip install 'deworldsg_ros[docs]'")
     text = (root_dir / "mkdocs.yml").read_text(encoding="utf-8")
     pages = [page for entry in yaml.safe_load(text)["nav"] for page in entry.values()]
-    assert len(pages) == 10
     assert set(pages) == {path.name for path in (root_dir / "docs").glob("*.md")}
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
