@@ -22,7 +22,7 @@ fail() {
   exit 1
 }
 
-newest_line() { tail -n 1 "$log" 2>/dev/null | tr -d '\r' | sed 's/^ *//' | cut -c 1-60; }
+newest_line() { tail -n 9 "$log" | sed -n '/^WARNING/!{s/^ *//;s/\r//g;h};${g;p}' | cut -c 1-60; }
 
 # quietly LABEL COMMAND...: run the command and show one line, with the newest line of its output.
 # Without a terminal, a line every 15 s. Show the whole output only if the command fails.

@@ -60,7 +60,8 @@ def lock(python: str, kept: dict[str, dict[str, Line]]) -> dict[str, dict[str, L
                 line for line in requirements(extras) if _name(NAME.split(line)[0]) not in have
             ]
             items = _resolved(python, wanted, constraints) if wanted else []
-            found[profile] = {**dict(map(_line, items)), **have}
+            new = [item for item in items if _name(item["metadata"]["name"]) not in have]
+            found[profile] = {**dict(map(_line, new)), **have}
             pinned = found[profile]
     return found
 

@@ -340,7 +340,7 @@ class Store:
         """Answer a question in Cypher; it cannot change the database, nor use other files.
 
         Args:
-            cypher: with the tables Object, Relation and Stay (docs/dev/store.md).
+            cypher: with the tables Object, Relation and Stay (docs/store.md).
             parameters: values of its ``$names``.
 
         Raises:

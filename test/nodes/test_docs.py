@@ -21,7 +21,7 @@ DOCS = ROOT / "docs"
 TOPICS_PAGE = DOCS / "topics_and_parameters.md"
 PAGES = (
     *(DOCS / "dev" / f"{name}.md" for name in ("nodes", "recordings", "reliability")),
-    DOCS / "troubleshooting.md",
+    *(DOCS / f"{name}.md" for name in ("many_robots", "troubleshooting")),
     TOPICS_PAGE,
 )
 # Everything that runs in the nodes.
