@@ -231,8 +231,10 @@ def edit_map(path: Path, request: EditRequest) -> EditReply:
         RefusedInput: ``invalid_request``, with the reason; the file is unchanged.
     """
     if not path.is_file():
+        what = "a folder, and " if path.is_dir() else ""
         raise ConfigurationError(
-            f"map {path}: expected a file that graph_node or --map has written"
+            f"map {path} is {what}no map: expected a file that graph_node (map_path) or `deworldsg "
+            "run RECORDING --out OUT --map FILE` has written"
         )
     lock = claim_map(path)
     try:

@@ -5,6 +5,7 @@ python tools/example_detector.py [--ros-args -r rgb/image_raw/compressed:=YOUR_T
 """
 
 import json
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -45,7 +46,5 @@ class ExampleDetector(Node):
 
 if __name__ == "__main__":
     rclpy.init()
-    try:
+    with suppress(KeyboardInterrupt, ExternalShutdownException):  # Ctrl-C, SIGTERM
         rclpy.spin(ExampleDetector())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass  # Ctrl-C, or SIGTERM

@@ -18,7 +18,7 @@ from rich.table import Table
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.cli.ask import AsJson, Live, Namespace, plain, print_json
 from deworldsg_ros.store import Store, StoreError
-from deworldsg_ros.store.store import EXAMPLES, StoreWriter, time_ns_from_text
+from deworldsg_ros.store.store import EXAMPLES, StoreWriter, clock_text, time_ns_from_text
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import join
 
@@ -82,16 +82,20 @@ def at(
     """Print where objects were at a time, and what they were called."""
     opened = Store(store)
     head = opened.head
-    stays = opened.at(time_ns_from_text(moment, head.stamp_ns), label)
+    time_ns = time_ns_from_text(moment, head.stamp_ns)
+    stays = opened.at(time_ns, label)
     if as_json:
         print_json([stay.to_dict() for stay in stays])
+        return
+    if not stays:
+        typer.echo(f"nothing at {clock_text(time_ns)}: {opened.why_nothing(time_ns, label)}")
         return
     where = plain(f"in {head.frame_id!r}")
     table = Table("object", "x, y, z (m)", "since", "until", box=box.SIMPLE, caption=where)
     for stay in stays:
         name, place = f"{stay.label} #{stay.node}", " ".join(f"{v:.2f}" for v in stay.position_m)
-        until = "" if stay.is_current else _clock(stay.until_ns)
-        table.add_row(plain(name), place, _clock(stay.since_ns), until)
+        until = "" if stay.is_current else clock_text(stay.until_ns)
+        table.add_row(plain(name), place, clock_text(stay.since_ns), until)
     Console().print(table)
 
 
@@ -141,10 +145,6 @@ def _parameter(text: str) -> tuple[str, Any]:
         return name, json.loads(value)
     except (ValueError, RecursionError):
         return name, value
-
-
-def _clock(time_ns: int) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(time_ns // 10**9))
 
 
 app = typer.Typer(

@@ -236,6 +236,13 @@ def read_graph(path: Path) -> wire.SceneGraphMessage:
         RefusedInput: ``unreadable_graph``, or the reason for which `wire.decode` refuses it.
     """
     content = read_content(path)
+    if content.startswith(b"PK"):  # a zip archive
+        raise RefusedInput(
+            "unreadable_graph",
+            f"{path} is no scene graph; if it is a map, a node (map_path) or `deworldsg run --map` "
+            f"goes on from it, and its graph is {GRAPH_FILE} in the folder of the run, or the file "
+            "that graph_node saves (save_path)",
+        )
     try:
         with paused_collector():
             return wire.decode(content, wire.SceneGraphMessage, MAX_GRAPH_BYTES)

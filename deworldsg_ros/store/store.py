@@ -252,7 +252,12 @@ def _session(message: GraphMessage) -> str:
 
 _AGO = re.compile(r"([\d.]+)\s*(s|min|h|d)\s+ago")
 _UNIT_S = {"s": 1, "min": 60, "h": 3600, "d": 86400}
-EXAMPLES = "10:00, 2026-03-01T10:00, '5 min ago' or the seconds of a stamp"
+EXAMPLES = "now, 10:00, 2026-03-01T10:00, '5 min ago' or the seconds of a stamp"
+
+
+def clock_text(time_ns: int) -> str:
+    """Nanoseconds as a date and time in the machine's time zone."""
+    return datetime.fromtimestamp(time_ns // 10**9).strftime("%Y-%m-%d %H:%M:%S")
 
 
 def time_ns_from_text(text: str, newest_ns: int) -> int:
@@ -260,14 +265,22 @@ def time_ns_from_text(text: str, newest_ns: int) -> int:
 
     Args:
         text: seconds of a stamp; a date and time of ISO 8601, of the machine's time zone if it has
-            none; a time of the day on which the graph is newest; or ``5 min ago``, counted from the
-            newest stamp.
+            none; a time of the day on which the graph is newest; ``now``, the newest stamp; or
+            ``5 min ago``, counted from it.
         newest_ns: the newest stamp of the graph.
 
     Raises:
         StoreError: for other text.
     """
-    text = text.strip()
+    time_ns = _time_ns(text.strip(), newest_ns)
+    if time_ns >= 2**63:
+        raise StoreError(f"time '{text[:40]}': expected one before 2262")
+    return max(time_ns, 0)
+
+
+def _time_ns(text: str, newest_ns: int) -> int:
+    if text == "now":
+        return newest_ns
     try:
         ago = _AGO.fullmatch(text)
         if ago is not None:
@@ -367,6 +380,28 @@ class Store:
                 {"time": time_ns, "labels": labels or [""]},
             )
         return [stay_of(row) for row in found.rows]
+
+    def why_nothing(self, time_ns: int, label: str | None = None) -> str:
+        """Why `at` has no answer: the history begins later, or nothing was called so."""
+        with self.opened() as database:
+            found = database.run(
+                "MATCH (s:Stay) RETURN s.label, min(s.since_ns), max(s.until_ns) ORDER BY s.label"
+            ).rows
+        if not found:
+            return "the store has no objects"
+        begin_ns = min(row[1] for row in found)
+        if time_ns < begin_ns:
+            return f"the history begins at {clock_text(begin_ns)}, with the first graph added"
+        asked = [row for row in found if label is None or is_class(label, row[0])]
+        if not asked:
+            return f"no {label} was ever there; there were {', '.join(row[0] for row in found)}"
+        begin_ns, end_ns = min(row[1] for row in asked), max(row[2] for row in asked)
+        what = label or "object"
+        if time_ns < begin_ns:
+            return f"the first {what} came at {clock_text(begin_ns)}"
+        if time_ns >= end_ns:
+            return f"the last {what} was gone at {clock_text(end_ns)}"
+        return f"no {what} was there then, but before and after"
 
     @property
     def head(self) -> Head:
