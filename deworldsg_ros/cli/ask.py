@@ -7,7 +7,7 @@ import math
 import re
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
@@ -35,10 +35,16 @@ from deworldsg_ros.graph.extent import DEFAULT_UP
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import rigid_motion
 from deworldsg_ros.scene.errors import ClientError
+from deworldsg_ros.scene.vocabulary import PREDICATES
+from deworldsg_ros.scene.vocabulary import plain as plain_name
 from deworldsg_ros.wire import messages as wire
 
 if TYPE_CHECKING:
     from deworldsg_ros.client import SceneGraphClient
+
+# Words between the two objects of a relation, the longest first.
+_PREDICATES = {"and", *(plain_name(name) for names in PREDICATES for name in names)}
+_BETWEEN = re.compile(rf"\s+(?:{'|'.join(sorted(_PREDICATES, key=len, reverse=True))})\s+")
 
 # --- `deworldsg query`, `goal` and `explain`: ask a scene graph.
 
@@ -140,7 +146,8 @@ def explain(
 ) -> None:
     """Explain why an object, a pair of objects or a class is in the graph, or is not.
 
-    The words are an id, two ids, a class, or a class and a place: "chair near (1.6, -0.5)".
+    The words are an id, a class, two of them (laptop "dining table", or "laptop on table"), or a
+    class and a place: "chair near (1.6, -0.5)".
     """
     if live and place_of(" ".join(words), DEFAULT_UP):
         from deworldsg_ros.client import SceneGraphClient
@@ -151,11 +158,7 @@ def explain(
         _print_explanation(told["subject"], told["lines"], told if as_json else None)
         return
     with _opened(words, live, namespace) as (graph, rest):
-        first, *others = [whole_number(word) for word in rest]
-        if len(others) == 1 and first is not None and others[0] is not None:
-            found = graph.explain((first, others[0]))
-        else:
-            found = graph.explain(_which(rest))
+        found = graph.explain(_pair(graph, rest) or _which(rest))
     _print_explanation(found.subject, found.lines, found.to_dict() if as_json else None)
 
 
@@ -203,6 +206,25 @@ def _with_looks(client: SceneGraphClient) -> SceneGraph:
     while client.graph.looks is None and time.monotonic() < end_s:
         time.sleep(0.05)
     return client.graph
+
+
+def _pair(graph: SceneGraph, words: list[str]) -> tuple[int | str, int | str] | None:
+    """Two objects that the words name, in two arguments or with a relation between; None = one."""
+    text = " ".join(words)
+    between = _BETWEEN.split(text, maxsplit=1)
+    parts = between if len(between) == 2 else words
+    if len(parts) != 2 or _is_known(graph, text) or place_of(text, graph.up):
+        return None
+    if parts is words and not all(_is_known(graph, part) for part in parts):
+        return None  # one name of two words, which the graph does not know
+    return _which(parts[:1]), _which(parts[1:])
+
+
+def _is_known(graph: SceneGraph, text: str) -> bool:
+    """Whether a text is an id, or what objects are called here."""
+    with suppress(ClientError):
+        return isinstance(_which([text]), int) or bool(graph.understand(text))
+    return False
 
 
 def _which(words: list[str]) -> int | str:

@@ -1,14 +1,12 @@
-"""`deworldsg run` and scripts/tour on the recording that ships."""
+"""`deworldsg run` on the recording that ships."""
 
 import itertools
 import json
-import os
 import signal
 import subprocess
-import sys
 
 import pytest
-from support.cli import COMMAND, DEMO_ROOM, ROOT, deworldsg, environment, invoke, printed
+from support.cli import COMMAND, DEMO_ROOM, deworldsg, environment, invoke, printed
 from support.recordings import camera_items, write_bag
 
 from deworldsg_ros import pipeline
@@ -102,25 +100,6 @@ def test_files_are_equal_to_the_byte_whatever_the_threads_and_the_seed_of_hashes
         )
         found.append({name: (folder / name).read_bytes() for name in FILES})
     assert [name for name in FILES if found[0][name] != found[1][name]] == []
-
-
-@pytest.mark.timeout(900)
-def test_the_tour_is_all_that_a_user_does_with_a_graph(tmp_path):
-    path = os.pathsep.join([str(ROOT), *sys.path[1:]])
-    done = subprocess.run(
-        [sys.executable, ROOT / "scripts" / "tour.py", DEMO_ROOM, tmp_path / "out"],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": path},
-        cwd=tmp_path,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    for words in (
-        ">>> which cup is on the table, where\ncup #", "stand at", "transform found",
-        "is a 'my mug'", "undone: delete", "labelled by hand: True", "undone: split", "relabelled",
-    ):  # fmt: skip
-        assert words in done.stdout
-    assert "MCP find" in done.stdout or "mcp is not installed" in done.stdout
 
 
 @pytest.fixture
