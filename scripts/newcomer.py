@@ -69,7 +69,9 @@ def run_part(steps: list[Step], environment: dict[str, str], limit_s: float = LI
     try:
         for step in steps:
             print(f"\n$ {step.command}", flush=True)
-            if step.command.endswith("&"):
+            if step.command.startswith("cd "):
+                os.chdir(step.command[3:])
+            elif step.command.endswith("&"):
                 running.append(_started(step, environment, limit_s))
             else:
                 _run(step, environment, limit_s)
