@@ -14,7 +14,7 @@ from deworldsg_ros.client.boxes import Footprint, footprint
 from deworldsg_ros.client.meanings import colour_shares, is_class, words_of
 from deworldsg_ros.graph.extent import box_of, surface_points
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.vocabulary import PREDICATES, plain
+from deworldsg_ros.scene.vocabulary import PREDICATES, plain, verb_of
 from deworldsg_ros.wire import messages as wire
 
 
@@ -243,8 +243,8 @@ class Relation:
 
     @property
     def text(self) -> str:
-        """For people: ``cup #13 on dining table #5``."""
-        return f"{self.subject.name} {self.predicate} {self.object.name}"
+        """For people: ``cup #13 is on dining table #5``."""
+        return f"{self.subject.name} {verb_of(self.predicate)} {self.object.name}"
 
     @property
     def evidence(self) -> str:

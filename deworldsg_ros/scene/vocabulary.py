@@ -101,9 +101,19 @@ PREDICATES: tuple[tuple[str, ...], ...] = (
 SYMMETRIC = frozenset({"near", "next to", "beside", "close by"})
 
 
+# What is no verb yet gets "is".
+_VERBS = {"with": "goes with", "has": "has", "says": "says", "wears": "wears"}
+
+
 def plain(name: str) -> str:
     """A name in lower case, with spaces."""
     return name.lower().replace("_", " ")
+
+
+def verb_of(predicate: str) -> str:
+    """A predicate between its subject and its object in a sentence: "on" is "is on"."""
+    name = plain(predicate)
+    return _VERBS.get(name, f"is {name}")
 
 
 # --- Names of classes and predicates, in the order of the distributions.

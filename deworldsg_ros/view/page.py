@@ -17,6 +17,7 @@ from deworldsg_ros.client.objects import SceneObject, scene_object
 from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import pose_from_quaternion
+from deworldsg_ros.scene.vocabulary import verb_of
 from deworldsg_ros.view.colours import class_colours, drawable_edges, predicate_colours, view_axes
 from deworldsg_ros.wire import messages as wire
 
@@ -98,6 +99,8 @@ def _node(item: SceneObject, colour: str, axes_of_view: Float64) -> dict[str, An
         "id": item.id,
         "label": item.label,
         "named": item.is_named,
+        "probability": round(item.probability, 3),
+        "sure": item.is_sure,
         "colour": colour,
         "looks": item.colour,
         "classes": [[belief.label, round(belief.probability, 3)] for belief in item.classes],
@@ -118,6 +121,7 @@ def _edge(edge: wire.EdgeState) -> dict[str, Any]:
         "subject": edge.subject,
         "object": edge.object,
         "predicate": edge.predicate,
+        "verb": verb_of(edge.predicate),
         "probability": round(edge.probability, 3),
         "provenance": edge.provenance,
         "observations": edge.observations,

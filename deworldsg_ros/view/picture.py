@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from matplotlib import patheffects, rc_context
 from matplotlib.axes import Axes
@@ -23,6 +22,7 @@ from deworldsg_ros.client.objects import SceneObject, scene_object
 from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.scene.arrays import Float64, UInt8, shared_areas
 from deworldsg_ros.scene.camera import pose_from_quaternion
+from deworldsg_ros.scene.vocabulary import verb_of
 from deworldsg_ros.view.colours import (
     QUIET,
     class_colours,
@@ -154,6 +154,7 @@ class TopView:
         corners: (n, 4, 2) of the boxes.
         heights: (n,) along up.
         points: (k, 2) surface points of each node.
+        sure: whether each node is sure (`SceneObject.is_sure`).
         path: (m, 2) camera positions.
     """
 
@@ -162,6 +163,7 @@ class TopView:
     corners: Float64
     heights: Float64
     points: tuple[Float64, ...]
+    sure: tuple[bool, ...]
     path: Float64
 
     @property
@@ -236,6 +238,7 @@ def _project(
         np.array([_corners(item, plane) for item in items], np.float64).reshape(-1, 4, 2),
         centres @ axes_of_view[2],
         tuple(surface_points(node) @ plane.T for node in graph.nodes),
+        tuple(item.is_sure for item in items),
         path.reshape(-1, 3) @ plane.T,
     )
 
@@ -283,8 +286,6 @@ def _strength(edge: wire.EdgeState) -> tuple[float, int]:
 PHOTO_IN, CAPTION_IN = 1.1, 0.3
 # More labels leave no free space on a page.
 MOST_LABELS = 90
-# Nodes that are objects with a smaller probability are pale and have a small label.
-SURE_FROM = 0.75
 # Of matplotlib's arc3 arrows: enough to separate an edge from its opposite.
 CURVATURE = 0.16
 HALO = [patheffects.withStroke(linewidth=2.6, foreground=BACKGROUND)]
@@ -305,8 +306,9 @@ def draw_labels(drawing: Drawing) -> Placement:
     rows = sorted(range(len(nodes)), key=lambda row: -nodes[row].observations)[:MOST_LABELS]
     if not rows:
         return Placement(np.zeros((0, 2)), np.zeros((0, 2)))
-    styles = [_label_style(nodes[row], len(rows)) for row in rows]
-    texts = [f"{nodes[row].label} {nodes[row].id}" for row in rows]
+    sure = drawing.view.sure
+    styles = [_label_style(sure[row], len(rows)) for row in rows]
+    texts = [f"{nodes[row].label}{'' if sure[row] else '?'} {nodes[row].id}" for row in rows]
     sizes = np.array([_text_size(axes, text, **style) for text, style in zip(texts, styles)])
     anchors = axes.transData.transform(drawing.view.means[rows])
     placed = place(anchors, sizes, _frame_px(axes))
@@ -355,6 +357,10 @@ def draw_frame(drawing: Drawing, strip_in: float = 0.0) -> None:
     title = f"{counted(len(graph.nodes), 'object')}, {counted(len(graph.edges), 'relation')}"
     figure.text(pad, top, title, fontsize=12, fontweight="bold", color=INK, va="center")
     note = "seen from above"
+    if drawing.edges:
+        note += "; arrows lead from A to B"
+    if not all(drawing.view.sure):
+        note += "; pale, with ?: not sure"
     if any(edge.predicate in QUIET for edge in graph.edges):
         note += "; relations “near” are left out"
     if len(drawing.view.path):
@@ -404,7 +410,7 @@ def _draw_scale(drawing: Drawing, pad: float, bottom: float) -> None:
 
 def _draw_legend(drawing: Drawing, pad: float, bottom: float) -> None:
     handles = [
-        Line2D([], [], color=tint, linewidth=2.0, label=predicate)
+        Line2D([], [], color=tint, linewidth=2.0, label=f"A {verb_of(predicate)} B")
         for predicate, tint in drawing.tints.items()
     ]
     if handles:
@@ -448,13 +454,8 @@ def _frame_px(axes: Axes) -> Float64:
     return np.array([extent.x0 + 4, extent.y0 + 4, extent.x1 - 4, extent.y1 - 4])
 
 
-def is_sure(node: wire.NodeState) -> bool:
-    """Whether a node is an object for sure, or its existence is not estimated."""
-    return node.existence is msgspec.UNSET or node.existence >= SURE_FROM
-
-
-def _label_style(node: wire.NodeState, label_count: int) -> dict[str, Any]:
-    if not is_sure(node):
+def _label_style(is_sure: bool, label_count: int) -> dict[str, Any]:
+    if not is_sure:
         return {"fontsize": 7.0, "alpha": 0.75}
     return {"fontsize": 9.0 if label_count <= 40 else 8.0, "fontweight": "bold"}
 
@@ -541,7 +542,7 @@ def _draw_boxes(drawing: Drawing) -> None:
     """Boxes of the nodes, higher objects on top; unsure ones paler."""
     view, nodes, axes = drawing.view, drawing.graph.nodes, drawing.axes
     for order, row in enumerate(np.argsort(view.heights)):
-        alpha = 1.0 if is_sure(nodes[row]) else 0.45
+        alpha = 1.0 if view.sure[row] else 0.45
         fill = drawing.colours[nodes[row].label]
         rim = shade(fill, 0.8)
         zorder = 3 + order / (len(nodes) + 1)

@@ -55,7 +55,7 @@ def test_parts_of_a_room_that_overlap_are_merged(room):
     assert len(whole) == len(room)
     assert len(combined.pairs) == len(first) + len(second) - len(room)
     assert rotation_angle_deg((combined.T_a_b @ T)[:3, :3]) < 0.5
-    assert "cup #13 on dining table #5" in {item.text for item in whole.relations()}
+    assert "cup #13 is on dining table #5" in {item.text for item in whole.relations()}
     both = {pair.before.id for pair in combined.pairs}
     for item in first:
         assert whole[item.id].observations == item.observations * (2 if item.id in both else 1)

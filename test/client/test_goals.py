@@ -162,7 +162,7 @@ def test_why(corner):
     assert "evidence: seen in 4 frames" in why.lines
     assert why.values["contact"] is True
     assert why.values["gap_m"] == pytest.approx(0.01, abs=1e-3)
-    assert "cup #1 on table #2: 90%" in graph.explain("cup").lines
+    assert "cup #1 is on table #2: 90%" in graph.explain("cup").lines
     assert "not in contact" in str(graph.explain((1, 5)))
     assert "cup #1 may be one: 10%" in graph.explain("other").lines
 

@@ -45,7 +45,7 @@ def test_an_agent_asks_over_stdio(demo_out):
             (answer, *_) = (await ask("find", question="cup on dining table"))["answers"]
             assert (answer["object"]["label"], answer["sure"]) == ("cup", True)
             (related, *_) = (await ask("list_relations", subject="13", predicate="on"))["relations"]
-            assert related["text"] == "cup #13 on dining table #5"
+            assert related["text"] == "cup #13 is on dining table #5"
             assert "exists with" in (await ask("get_object_context", object="cup"))["explanation"]
             goal = await ask("goal_near", object="13", distance_m=0.8)
             assert goal["distance_m"] == pytest.approx(0.8)

@@ -63,11 +63,11 @@ def test_a_click_shows_an_object_and_escape_lets_go(chromium, tmp_path):
         assert np.linalg.norm(np.subtract(*middles)) > 0.1, "opposite edges are apart"
         shown.locator("#list li.object", has_text="cup 1").click()
         card = shown.locator("#card").inner_text()
-        assert "cup 1 on table 2" in card and "80" in card and "seen in" in card
+        assert "cup 1 is on table 2" in card and "80" in card and "seen in" in card
         # A predicate that is hidden stays hidden, whatever is selected.
         shown.locator("#predicates label", has_text="on").click()
         assert visible_arrows(shown) == ["under"]
-        assert "cup 1 on table 2" not in shown.locator("#card").inner_text()
+        assert "cup 1 is on table 2" not in shown.locator("#card").inner_text()
         shown.keyboard.press("Escape")
         assert "Esc" in shown.locator("#card").inner_text()
         place = shown.evaluate(

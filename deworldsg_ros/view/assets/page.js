@@ -4,7 +4,7 @@
 
 const graph = JSON.parse(document.getElementById("graph").textContent);
 const nodes = new Map(graph.nodes.map(node => [node.id, node]));
-const name = id => `${nodes.get(id).label} ${id}`;
+const name = id => `${nodes.get(id).label}${nodes.get(id).sure ? "" : "?"} ${id}`;
 const percent = value => `${Math.round(100 * value)}\u00a0%`;
 const byId = id => document.getElementById(id);
 
@@ -26,9 +26,7 @@ let chosen = null;  // id of the object that was clicked
 let pointed = null;  // id of the object under the pointer
 
 const isOf = (edge, id) => edge.subject === id || edge.object === id;
-const belief = node =>
-  (node.existence ?? 1) * (node.named && node.classes.length ? node.classes[0][1] : 1);
-const showsNode = node => !hiddenClasses.has(node.label) && belief(node) >= least.object;
+const showsNode = node => !hiddenClasses.has(node.label) && node.probability >= least.object;
 const showsEdge = edge => !hiddenPredicates.has(edge.predicate) &&
   edge.probability >= least.relation &&
   showsNode(nodes.get(edge.subject)) && showsNode(nodes.get(edge.object));
@@ -55,7 +53,7 @@ function boxOf(node) {
   const body = new THREE.Mesh(unitBox, new THREE.MeshLambertMaterial({
     color: node.colour, transparent: true, opacity: 0.16, depthWrite: false }));
   const rim = new THREE.LineSegments(unitEdges, new THREE.LineBasicMaterial({
-    color: node.colour, transparent: true, opacity: belief(node) < 0.5 ? 0.45 : 0.95 }));
+    color: node.colour, transparent: true, opacity: node.sure ? 0.95 : 0.45 }));
   body.userData.id = node.id;
   group.add(body, rim);
   const [a, b, c, d, e, f, g, h, i] = node.axes;
@@ -214,7 +212,7 @@ function refresh() {
     group.visible = !hiddenKinds.has("boxes") && showsNode(node);
     clouds[row].visible = !hiddenKinds.has("points") && showsNode(node);
     body.material.opacity = node.id === first ? 0.4 : isNear(node.id) ? 0.16 : 0.05;
-    rim.material.opacity = isNear(node.id) ? (belief(node) < 0.5 ? 0.45 : 0.95) : 0.2;
+    rim.material.opacity = isNear(node.id) ? (node.sure ? 0.95 : 0.45) : 0.2;
   });
   for (const { edge, group, paint } of arrows) {
     group.visible = !hiddenKinds.has("relations") && showsEdge(edge) &&
@@ -266,7 +264,7 @@ function showCard(id) {
     .map(([label, p]) => `${label} ${percent(p)}`);
   if (node.other >= 0.01) classes.push(`others ${percent(node.other)}`);
   for (const [term, text] of [
-    [node.named ? `is a ${node.label}` : "is an object", percent(belief(node))],
+    [node.named ? `is a ${node.label}` : "is an object", percent(node.probability)],
     ["exists", node.existence === null ? null : percent(node.existence)],
     ["if it exists", (node.named ? "" : "perhaps ") + classes.join(", ")],
     ["size", `${node.sizeWords.join(" × ")} cm`],
@@ -277,7 +275,7 @@ function showCard(id) {
   const list = element("ul");
   for (const edge of graph.edges.filter(edge => isOf(edge, id) && showsEdge(edge))) {
     const line = element("li");
-    line.append(name(edge.subject), " ", element("b", "", edge.predicate), " ", name(edge.object),
+    line.append(name(edge.subject), " ", element("b", "", edge.verb), " ", name(edge.object),
       " ", element("span", "quiet", `${percent(edge.probability)}, ${SOURCES[edge.provenance]}`));
     line.onclick = () => choose(edge.subject === id ? edge.object : edge.subject);
     list.append(line);
@@ -328,7 +326,7 @@ function objectItem(node) {
   item.dataset.id = node.id;
   dot.style.background = node.colour;
   item.append(dot, element("span", "name", name(node.id)),
-    element("span", "quiet", percent(belief(node))));
+    element("span", "quiet", percent(node.probability)));
   item.onclick = () => choose(node.id);
   item.onmouseenter = () => { pointed = node.id; refresh(); };
   item.onmouseleave = () => { pointed = null; refresh(); };
