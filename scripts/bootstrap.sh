@@ -124,7 +124,7 @@ pip_install() { "$venv/bin/python" -m pip install --no-input --prefer-binary \
 # DEWORLDSG_TEST_MODELS set, test includes torch and transformers. A sourced ROS needs no ROS wheels.
 # It needs the major version of numpy with which its message types were compiled.
 install_requirements() {
-  local ros=$1 profile=$2 extras=(build run view) arguments=() list expected
+  local ros=$1 profile=$2 extras=(build run) arguments=() list expected
   if [ -n "${DEWORLDSG_LOCKED:-}" ]; then
     install_locked "$ros" "$profile"
     return

@@ -247,7 +247,7 @@ def view(
 ) -> None:
     """Show a graph in the browser, in 3D, while it grows.
 
-    Needs pip install 'deworldsg_ros[view]'; with --foxglove: 'deworldsg_ros[foxglove]'.
+    With --foxglove, it needs pip install 'deworldsg_ros[foxglove]'.
     """
     with _reporting_errors():
         from deworldsg_ros.cli.view import ViewOptions, view_graph

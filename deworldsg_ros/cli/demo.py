@@ -17,7 +17,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any
 
@@ -240,9 +239,6 @@ class DemoView:
 
         The demo calls it when the nodes are ready, so that they do not start later.
         """
-        if find_spec("viser") is None:
-            self._note("it needs the package viser: pip install 'deworldsg_ros[view]'")
-            return
         command = [*node_command(VIEWER), "--ros-args", "--params-file", str(self._config)]
         _start_process(self._processes, VIEWER, command, dds_environment(), self._log)
         viewer = self._processes[-1]

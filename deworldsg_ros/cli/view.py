@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from deworldsg_ros.view.live.sources import Sink
 
 VIEWER = "viewer_node"
-# Package and extra of each module that shows a graph.
-VIEWERS = {"viser": ("viser", "view"), "foxglove": ("foxglove-sdk", "foxglove")}
 # Surface points are part of what is shown.
 WITH_POINTS = "output.include_surface_points=true"
 EMPTY_FILE = "the graph of this file is empty: no object was seen often enough"
@@ -66,9 +64,13 @@ def view_graph(options: ViewOptions, console: Console) -> None:
     """Show the page until Ctrl-C.
 
     Raises:
-        DeWorldSGError: for unusable input, or without the package viser.
+        DeWorldSGError: for unusable input, or without the package of Foxglove.
     """
-    require("foxglove" if options.foxglove else "viser")
+    if options.foxglove and find_spec("foxglove") is None:
+        raise ConfigurationError(
+            "deworldsg view --foxglove needs the package foxglove-sdk: pip install "
+            "'deworldsg_ros[foxglove]'"
+        )
     if options.path is None:
         _become_viewer_node(options)
         return
@@ -85,15 +87,6 @@ def view_graph(options: ViewOptions, console: Console) -> None:
             _show_recording(viewer, options, console)
         console.print("press Ctrl-C to end", highlight=False)
         wait_for_interrupt()
-
-
-def require(module: str) -> None:
-    """Raise ConfigurationError if a module of VIEWERS is not installed."""
-    if find_spec(module) is None:
-        package, extra = VIEWERS[module]
-        raise ConfigurationError(
-            f"deworldsg view needs the package {package}: pip install 'deworldsg_ros[{extra}]'"
-        )
 
 
 def wait_for_interrupt() -> None:

@@ -40,7 +40,8 @@ class ViewerNode(StageNode):
     """Follows the graph and shows it.
 
     Raises:
-        ConfigurationError: without the package viser.
+        ConfigurationError: for an address that this machine cannot listen on, or without the
+            package for Foxglove.
     """
 
     PARAMETERS = ViewerParameters
@@ -125,7 +126,7 @@ class ViewerNode(StageNode):
 
 
 def make_viewer(options: ViewerOptions, why_empty: str, on_error: OnError) -> Sink:
-    """The page, with its address in the log; raises ConfigurationError without its package."""
+    """The page, with its address in the log; raises ConfigurationError without the package."""
     try:
         viewer = open_sink(
             options.host,
@@ -135,9 +136,8 @@ def make_viewer(options: ViewerOptions, why_empty: str, on_error: OnError) -> Si
             on_error=on_error,
         )
     except ImportError as error:
-        extra = "foxglove" if options.foxglove else "view"
         raise ConfigurationError(
-            f"viewer_node: {error}: pip install 'deworldsg_ros[{extra}]'"
+            f"viewer_node: {error}: pip install 'deworldsg_ros[foxglove]'"
         ) from error
     print(f"view: {viewer.url}", flush=True)
     return viewer

@@ -1,4 +1,8 @@
-"""The graph as one HTML page with a 3D view; the file contains everything and works offline."""
+"""The graph as one HTML page with a 3D view: what the page shows of it, as plain values.
+
+A kept page is one file that contains everything and works offline (`write`). The live viewer sends
+the same values as messages (`live.server`).
+"""
 
 from __future__ import annotations
 
@@ -6,25 +10,39 @@ import base64
 import json
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deworldsg_ros.base.files import write_atomically
-from deworldsg_ros.client.objects import SceneObject, scene_object
+from deworldsg_ros.client.explain import explain_relation
+from deworldsg_ros.client.objects import SceneObject, relation_of, scene_object
 from deworldsg_ros.graph.extent import surface_points
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.camera import pose_from_quaternion
 from deworldsg_ros.scene.vocabulary import verb_of
-from deworldsg_ros.view.colours import class_colours, drawable_edges, predicate_colours, view_axes
+from deworldsg_ros.view.colours import (
+    MUTUAL,
+    SIGMAS,
+    class_colours,
+    drawable_edges,
+    predicate_colours,
+    principal_axes,
+    view_axes,
+)
 from deworldsg_ros.wire import messages as wire
 
 ASSETS = Path(__file__).with_name("assets")
 # More add megabytes, not detail.
 MOST_POINTS = 20_000
 MOST_PATH_POINTS = 1_000
+# Relations whose reasons a kept page has, the most probable ones.
+MOST_REASONS = 400
+# A second class is worth a word from this share of the first one's probability on, and as likely
+# as the first from the other.
+PERHAPS, AS_LIKELY = 0.1, 0.5
 
 
 def write(
@@ -47,27 +65,32 @@ def write(
         OSError: if the page cannot be written.
     """
     content = content_of(graph, view_axes(up_world), camera_path_world)
+    write_atomically(Path(path), html_of(f"Scene graph of {len(graph.nodes)} objects", content))
+
+
+def html_of(title: str, content: dict[str, Any] | None) -> str:
+    """The page.
+
+    Args:
+        title: of the window.
+        content: its first message (`content_of`); None = the page asks the server that it is from.
+    """
     parts = {
-        "__TITLE__": f"Scene graph of {len(graph.nodes)} objects",
-        "__GRAPH__": _script_safe(json.dumps(content)),
+        "__TITLE__": title,
+        # It cannot end its element.
+        "__GRAPH__": json.dumps(content, separators=(",", ":")).replace("<", "\\u003c"),
         "__THREE__": (ASSETS / "three.min.js").read_text(encoding="utf-8"),
         "__PAGE__": (ASSETS / "page.js").read_text(encoding="utf-8"),
     }
     html = (ASSETS / "page.html").read_text(encoding="utf-8")
     # In one pass: a label may contain one of these names.
-    html = re.sub("|".join(parts), lambda match: parts[match[0]], html)
-    write_atomically(Path(path), html)
-
-
-def _script_safe(text: str) -> str:
-    """JSON that cannot end the script element around it."""
-    return text.replace("<", "\\u003c")
+    return re.sub("|".join(parts), lambda match: parts[match[0]], html)
 
 
 def content_of(
     graph: wire.SceneGraphMessage, axes_of_view: Float64, camera_path_world: Float64 | None
 ) -> dict[str, Any]:
-    """Everything that the page shows, as plain values.
+    """Everything that a kept page shows, as the message that a live one would get.
 
     Args:
         graph: the graph, with or without surface points.
@@ -75,71 +98,134 @@ def content_of(
             are in these axes, but for those that it prints.
         camera_path_world: (n, 3) positions of the camera, metres; None = not drawn.
     """
-    colours = class_colours(node.label for node in graph.nodes)
     up = axes_of_view[2].tolist()
-    items = [scene_object(node, graph.frame_id, (up[0], up[1], up[2])) for node in graph.nodes]
+    items = {
+        node.id: scene_object(node, graph.frame_id, (up[0], up[1], up[2])) for node in graph.nodes
+    }
     edges = sorted(drawable_edges(graph), key=lambda edge: -edge.probability)
     hidden = graph.hidden if isinstance(graph.hidden, list) else []
     path = np.zeros((0, 3)) if camera_path_world is None else np.asarray(camera_path_world)
     path = path[:: max(1, -(-len(path) // MOST_PATH_POINTS))].reshape(-1, 3)
+    clouds = {node.id: surface_points(node) for node in graph.nodes}
+    stride = max(1, -(-sum(map(len, clouds.values())) // MOST_POINTS))
     return {
-        "frame_id": graph.frame_id,
-        "nodes": [_node(item, colours[item.label], axes_of_view) for item in items],
-        "edges": [_edge(edge) for edge in edges],
-        "tints": predicate_colours(Counter(edge.predicate for edge in edges)),
-        "hidden": Counter(node.reason for node in hidden),
-        "points": _points(graph, axes_of_view),
-        "path": np.round(path @ axes_of_view.T, 3).tolist(),
+        "head": {
+            **colours_of(items.values(), edges),
+            "frame_id": graph.frame_id,
+            "hidden": Counter(node.reason for node in hidden),
+        },
+        "nodes": [values_of(item, axes_of_view) for item in items.values()],
+        "edges": [
+            {**edge_values(edge), **({"why": why(edge, items)} if rank < MOST_REASONS else {})}
+            for rank, edge in enumerate(edges)
+        ],
+        "clouds": [
+            cloud_values(item, clouds[item.id][::stride], axes_of_view) for item in items.values()
+        ],
+        "path": path_values(path, axes_of_view),
     }
 
 
-def _node(item: SceneObject, colour: str, axes_of_view: Float64) -> dict[str, Any]:
+def colours_of(
+    items: Iterable[SceneObject], edges: Iterable[wire.EdgeState]
+) -> dict[str, dict[str, str]]:
+    """#rrggbb of each class and of each predicate, the frequent ones first, and their verbs."""
+    counts = Counter(edge.predicate for edge in edges)
+    return {
+        "colours": class_colours(item.label for item in sorted(items, key=lambda item: item.id)),
+        "tints": predicate_colours(counts),
+        "verbs": {predicate: verb_of(predicate) for predicate in counts},
+    }
+
+
+def values_of(item: SceneObject, axes_of_view: Float64) -> dict[str, Any]:
+    """What the page shows of an object."""
     rotation = pose_from_quaternion(np.zeros(3), np.array(item.orientation_xyzw))[:3, :3]
+    deviations, axes = principal_axes(np.array(item.covariance_m2))
+    words = in_words(item)
     return {
         "id": item.id,
         "label": item.label,
         "named": item.is_named,
         "probability": round(item.probability, 3),
         "sure": item.is_sure,
-        "colour": colour,
+        "words": words if words != item.label else None,
         "looks": item.colour,
         "classes": [[belief.label, round(belief.probability, 3)] for belief in item.classes],
         "other": round(item.other_classes, 3),
         "existence": None if item.existence is None else round(item.existence, 3),
         "observations": item.observations,
-        "position": np.round(item.position_m, 3).tolist(),
-        "size": np.round(item.size_m, 3).tolist(),
+        "position": _rounded(item.position_m, 3),
+        "size": _rounded(item.size_m, 3),
         "sizeWords": item.size_words,
-        "centre": np.round(axes_of_view @ item.position_m, 4).tolist(),
+        "centre": _rounded(axes_of_view @ item.position_m, 4),
         # Columns of the rotation, one after the other.
-        "axes": np.round((axes_of_view @ rotation).T, 4).ravel().tolist(),
+        "axes": _rounded((axes_of_view @ rotation).T.ravel(), 4),
+        # The Gaussian: its mean, and its half axes at 2σ, one after the other.
+        "mean": _rounded(axes_of_view @ item.mean_m, 3),
+        "deviations": _rounded((axes_of_view @ (axes * SIGMAS * deviations)).T.ravel(), 3),
     }
 
 
-def _edge(edge: wire.EdgeState) -> dict[str, Any]:
+def edge_values(edge: wire.EdgeState) -> dict[str, Any]:
+    """What the page shows of a relation."""
     return {
         "subject": edge.subject,
         "object": edge.object,
         "predicate": edge.predicate,
-        "verb": verb_of(edge.predicate),
+        "mutual": edge.mutual is True or edge.predicate in MUTUAL,
         "probability": round(edge.probability, 3),
         "provenance": edge.provenance,
-        "observations": edge.observations,
     }
 
 
-def _points(graph: wire.SceneGraphMessage, axes_of_view: Float64) -> dict[str, Any]:
-    """The surface points: int16 steps from a corner, base64, and how many each node has."""
-    clouds = [surface_points(node) for node in graph.nodes]
-    stride = max(1, -(-sum(map(len, clouds)) // MOST_POINTS))
-    clouds = [cloud[::stride] @ axes_of_view.T for cloud in clouds]
-    points = np.concatenate([*clouds, np.zeros((0, 3))])
-    low = points.min(axis=0) if len(points) else np.zeros(3)
-    step = max(float((points - low).max(initial=0.0)) / np.iinfo(np.uint16).max, 1e-6)
-    steps = np.round((points - low) / step).astype("<u2")
+def why(edge: wire.EdgeState, items: Mapping[int, SceneObject]) -> list[str]:
+    """Where the belief in a relation comes from, in sentences."""
+    relation = relation_of(edge, items[edge.subject], items[edge.object], None)
+    return list(explain_relation(relation).lines)
+
+
+def cloud_values(
+    item: SceneObject, points: Float32 | Float64, axes_of_view: Float64
+) -> dict[str, Any]:
+    """Surface points (n, 3) of an object: int16 millimetres from its centre, base64."""
+    steps = np.clip((points - np.array(item.position_m)) @ axes_of_view.T * 1000, -32767, 32767)
     return {
-        "low": low.tolist(),
-        "step": step,
-        "counts": [len(cloud) for cloud in clouds],
-        "xyz": base64.b64encode(steps.tobytes()).decode(),
+        "id": item.id,
+        "from": _rounded(axes_of_view @ item.position_m, 4),
+        "mm": base64.b64encode(np.round(steps).astype("<i2").tobytes()).decode(),
     }
+
+
+def path_values(positions_world: Float64, axes_of_view: Float64) -> list[list[float]]:
+    """Positions (n, 3) of the camera."""
+    values: list[list[float]] = np.round(positions_world @ axes_of_view.T, 3).tolist()
+    return values
+
+
+def in_words(item: SceneObject) -> str:
+    """The class of an object as one would say it: "cup, or perhaps a bowl"."""
+    if not item.classes:
+        return item.label
+    first = item.classes[0]
+    if not item.is_named:
+        return f"something, perhaps {_article(first.label)} {first.label}"
+    others = [c for c in item.classes[1:] if c.probability >= PERHAPS * first.probability]
+    likely = [c.label for c in others if c.probability >= AS_LIKELY * first.probability]
+    if likely:
+        rest = ", or something else" if item.other_classes > first.probability else ""
+        return " or ".join([first.label, *likely[:2]]) + rest
+    if others:
+        return f"{first.label}, or perhaps {_article(others[0].label)} {others[0].label}"
+    if item.other_classes > PERHAPS * first.probability:
+        return f"{first.label}, or perhaps something else"
+    return first.label
+
+
+def _article(noun: str) -> str:
+    return "an" if noun[:1].lower() in "aeiou" else "a"
+
+
+def _rounded(values: Any, digits: int) -> list[float]:
+    rounded: list[float] = np.round(np.asarray(values, np.float64), digits).tolist()
+    return rounded

@@ -1,6 +1,5 @@
 """`deworldsg demo`: four node processes over DDS give the same graph as one process."""
 
-import io
 import json
 import os
 import re
@@ -13,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 from support.cli import DEMO_ROOM, deworldsg, start
 
 from deworldsg_ros.cli import demo
@@ -141,14 +139,3 @@ def test_a_process_that_starts_during_an_interrupt_is_listed(monkeypatch):
     with pytest.raises(KeyboardInterrupt), demo.one_interrupt():
         demo._start_process(processes, "a node")
     assert len(processes) == 1
-
-
-def test_the_demo_goes_on_without_the_viewer(tmp_path, monkeypatch):
-    console = Console(file=io.StringIO(), width=200)
-    monkeypatch.setattr(demo, "find_spec", lambda name: None)
-    processes = []
-    view = demo.DemoView(processes, tmp_path / "config.yaml", tmp_path, console)
-    view.start()
-    view.stay_open()
-    assert processes == []
-    assert "pip install 'deworldsg_ros[view]'" in console.file.getvalue()

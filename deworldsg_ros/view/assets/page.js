@@ -1,12 +1,21 @@
 "use strict";
 // The page of a graph: a 3D view (three.js), filters, a list of objects, the card of one object.
-// Positions are in metres, with z up.
+// Positions are in metres, with z up. A kept page has its only message inside; a live one gets
+// messages with what changed from its server, and tells it what it wants to see.
 
-const graph = JSON.parse(document.getElementById("graph").textContent);
-const nodes = new Map(graph.nodes.map(node => [node.id, node]));
+const byId = id => document.getElementById(id);
+const kept = JSON.parse(byId("graph").textContent);
+const isLive = kept === null;
+
+const nodes = new Map(), edges = new Map(), clouds = new Map(), photos = new Map();
+let head = { colours: {}, tints: {}, verbs: {}, frame_id: "", hidden: {}, why: "waiting for the server" };
+let path = [];  // where the camera was
+let eye = null;  // the camera now: centre, axes, fov, aspect
+
+const keyOf = ({ subject, object }) => `${subject} ${object}`;
 const name = id => `${nodes.get(id).label}${nodes.get(id).sure ? "" : "?"} ${id}`;
 const percent = value => `${Math.round(100 * value)}\u00a0%`;
-const byId = id => document.getElementById(id);
+const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
 
 function element(tag, className, text) {
   const made = document.createElement(tag);
@@ -18,20 +27,34 @@ function element(tag, className, text) {
 // --- what is shown -------------------------------------------------------------------------------
 
 // So many edges are "near" that they hide the others.
-const hiddenPredicates = new Set("near" in graph.tints ? ["near"] : []);
+const hiddenPredicates = new Set(["near"]);
 const hiddenClasses = new Set();
-const hiddenKinds = new Set();
+const hiddenKinds = new Set(["Gaussians", "follow"]);
 const least = { object: 0, relation: 0.5 };
 let chosen = null;  // id of the object that was clicked
 let pointed = null;  // id of the object under the pointer
 
 const isOf = (edge, id) => edge.subject === id || edge.object === id;
 const showsNode = node => !hiddenClasses.has(node.label) && node.probability >= least.object;
-const showsEdge = edge => !hiddenPredicates.has(edge.predicate) &&
-  edge.probability >= least.relation &&
-  showsNode(nodes.get(edge.subject)) && showsNode(nodes.get(edge.object));
 
-// --- the 3D view ---------------------------------------------------------------------------------
+// Of two equal relations in both directions, the less probable one says nothing more.
+function isDouble(edge) {
+  const other = edge.mutual && edges.get(`${edge.object} ${edge.subject}`);
+  return other && other.predicate === edge.predicate &&
+    (other.probability - edge.probability || edge.subject - edge.object) > 0;
+}
+
+const showsEdge = edge => !hiddenPredicates.has(edge.predicate) && !isDouble(edge) &&
+  edge.probability >= least.relation && nodes.has(edge.subject) && nodes.has(edge.object) &&
+  showsNode(nodes.get(edge.subject)) && showsNode(nodes.get(edge.object));
+const visibleNodes = () => [...nodes.values()].filter(showsNode);
+const visibleEdges = () => {
+  const first = pointed ?? chosen;
+  return hiddenKinds.has("relations") ? [] : [...edges.values()].filter(
+    edge => showsEdge(edge) && (first === null || isOf(edge, first)));
+};
+
+// --- the 3D view: a few meshes, whatever the number of objects ------------------------------------
 
 const view = byId("view");
 const renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
@@ -40,44 +63,103 @@ const camera = new THREE.PerspectiveCamera(50, 1, 0.05, 1000);
 camera.up.set(0, 0, 1);
 const controls = new THREE.OrbitControls(camera, renderer.domElement);
 view.prepend(renderer.domElement);
-scene.add(new THREE.AmbientLight(0xffffff, 2.2));
-const sun = new THREE.DirectionalLight(0xffffff, 1.5);
-sun.position.set(1, -2, 3);
-scene.add(sun);
 
-const unitBox = new THREE.BoxGeometry(1, 1, 1);
-const unitEdges = new THREE.EdgesGeometry(unitBox);
-
-function boxOf(node) {
-  const group = new THREE.Group();
-  const body = new THREE.Mesh(unitBox, new THREE.MeshLambertMaterial({
-    color: node.colour, transparent: true, opacity: 0.16, depthWrite: false }));
-  const rim = new THREE.LineSegments(unitEdges, new THREE.LineBasicMaterial({
-    color: node.colour, transparent: true, opacity: node.sure ? 0.95 : 0.45 }));
-  body.userData.id = node.id;
-  group.add(body, rim);
-  const [a, b, c, d, e, f, g, h, i] = node.axes;
-  group.matrixAutoUpdate = false;
-  const [x, y, z] = node.size.map(side => Math.max(side, 0.005));
-  group.matrix.set(a * x, d * y, g * z, node.centre[0], b * x, e * y, h * z, node.centre[1],
-    c * x, f * y, i * z, node.centre[2], 0, 0, 0, 1);
-  group.matrixWorldNeedsUpdate = true;
-  return { node, group, body, rim };
+const paint = { vertexColors: true, transparent: true, depthWrite: false };
+const empty = () => new THREE.BufferGeometry();
+const layers = {
+  faces: new THREE.Mesh(empty(), new THREE.MeshBasicMaterial(paint)),
+  rims: new THREE.LineSegments(empty(), new THREE.LineBasicMaterial(paint)),
+  rings: new THREE.LineSegments(empty(), new THREE.LineBasicMaterial(paint)),
+  points: new THREE.Points(empty(), new THREE.PointsMaterial(
+    { ...paint, size: 2, sizeAttenuation: false })),
+  arrows: new THREE.Mesh(empty(), new THREE.MeshBasicMaterial(paint)),
+  camera: new THREE.LineSegments(empty(), new THREE.LineBasicMaterial(paint)),
+};
+for (const layer of Object.values(layers)) {
+  layer.frustumCulled = false;
+  scene.add(layer);
 }
 
-function cloudsOf({ low, step, counts, xyz }) {
-  const bytes = Uint8Array.from(atob(xyz), character => character.charCodeAt(0));
-  const steps = new Uint16Array(bytes.buffer);
-  let start = 0;
-  return graph.nodes.map((node, row) => {
-    const values = new Float32Array(3 * counts[row]);
-    for (let at = 0; at < values.length; at++) values[at] = low[at % 3] + step * steps[start + at];
-    start += values.length;
-    const shape = new THREE.BufferGeometry();
-    shape.setAttribute("position", new THREE.Float32BufferAttribute(values, 3));
-    return new THREE.Points(shape, new THREE.PointsMaterial({
-      color: node.colour, size: 2, sizeAttenuation: false, transparent: true, opacity: 0.7 }));
-  });
+function fill(layer, positions, colours, index) {
+  const shape = new THREE.BufferGeometry();
+  shape.setAttribute("position", new THREE.Float32BufferAttribute(positions, 3));
+  shape.setAttribute("color", new THREE.Float32BufferAttribute(colours, 4));
+  if (index) shape.setIndex(index);
+  layer.geometry.dispose();
+  layer.geometry = shape;
+  layer.visible = positions.length > 0;
+}
+
+const known = new Map();
+function rgb(colour) {
+  if (!known.has(colour)) known.set(colour, new THREE.Color(colour).toArray());
+  return known.get(colour);
+}
+const rgbOf = node => rgb(head.colours[node.label] ?? "#8d93a5");
+
+// Corners of a unit cube, its sides and its triangles.
+const CORNERS = [...Array(8).keys()].map(k => [k >> 2 & 1, k >> 1 & 1, k & 1].map(b => b - 0.5));
+const SIDES = [0, 1, 0, 2, 0, 4, 1, 3, 1, 5, 2, 3, 2, 6, 3, 7, 4, 5, 4, 6, 5, 7, 6, 7];
+const TRIANGLES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4],
+  [1, 5, 7, 3]].flatMap(([a, b, c, d]) => [a, b, c, a, c, d]);
+
+function cornersOf({ centre, axes, size }) {
+  const [x, y, z] = size.map(side => Math.max(side, 0.005));
+  return CORNERS.map(([i, j, k]) => [0, 1, 2].map(at =>
+    centre[at] + i * x * axes[at] + j * y * axes[3 + at] + k * z * axes[6 + at]));
+}
+
+function drawBoxes() {
+  const first = pointed ?? chosen, near = new Set([first]);
+  if (first !== null)
+    for (const edge of edges.values())
+      if (isOf(edge, first) && showsEdge(edge)) near.add(edge.subject).add(edge.object);
+  const places = [], faceColours = [], rimColours = [], index = [], rims = [], sides = [];
+  const rings = [], ringColours = [];
+  for (const node of visibleNodes()) {
+    const colour = rgbOf(node), isNear = first === null || near.has(node.id);
+    const start = places.length / 3;
+    const opacity = node.id === first ? 0.4 : isNear ? (node.sure ? 0.18 : 0.08) : 0.04;
+    const rim = isNear ? (node.sure ? 0.95 : 0.45) : 0.2;
+    if (!hiddenKinds.has("boxes")) {
+      for (const corner of cornersOf(node)) {
+        places.push(...corner);
+        faceColours.push(...colour, opacity);
+        rimColours.push(...colour, rim);
+      }
+      for (const corner of TRIANGLES) index.push(start + corner);
+      for (const corner of SIDES) sides.push(start + corner);
+    }
+    if (!hiddenKinds.has("Gaussians"))
+      for (const [a, b] of [[0, 3], [3, 6], [6, 0]])
+        for (let step = 0; step < 48; step++) {
+          const angle = Math.PI * Math.floor((step + 1) / 2) / 12, d = node.deviations;
+          for (let at = 0; at < 3; at++)
+            rings.push(node.mean[at] + Math.cos(angle) * d[a + at] + Math.sin(angle) * d[b + at]);
+          ringColours.push(...colour, rim);
+        }
+  }
+  fill(layers.faces, places, faceColours, index);
+  fill(layers.rims, places, rimColours, sides);
+  fill(layers.rings, rings, ringColours);
+}
+
+function drawPoints() {
+  const shown = hiddenKinds.has("points") ? [] : visibleNodes().filter(({ id }) => clouds.has(id));
+  const count = shown.reduce((sum, { id }) => sum + clouds.get(id).length, 0);
+  const places = new Float32Array(count), colours = new Float32Array(count / 3 * 4);
+  const first = pointed ?? chosen;
+  let at = 0;
+  for (const node of shown) {
+    const cloud = clouds.get(node.id), colour = rgbOf(node);
+    places.set(cloud, at);
+    for (let row = at / 3; row < (at + cloud.length) / 3; row++) {
+      colours.set(colour, 4 * row);
+      colours[4 * row + 3] = first === null || node.id === first ? 0.7 : 0.15;
+    }
+    at += cloud.length;
+  }
+  fill(layers.points, places, colours);
 }
 
 // An edge and its opposite bend to different sides.
@@ -92,66 +174,131 @@ function curveOf(edge) {
   return new THREE.QuadraticBezierCurve3(tail, middle, tip);
 }
 
-const cone = new THREE.ConeGeometry(1, 2.6, 10);
-cone.rotateX(Math.PI / 2);  // it points along z
+let middles = [];  // of the drawn relations: [edge, place]
 
-function arrowOf(edge) {
-  const curve = curveOf(edge), length = Math.max(curve.getLength(), 1e-3);
-  const paint = new THREE.MeshBasicMaterial({ color: graph.tints[edge.predicate],
-    transparent: true, opacity: 0.25 + 0.65 * edge.probability ** 2 });
-  const group = new THREE.Group();
-  const radius = Math.min(0.0022 * reach, 0.03 * length);
-  group.add(new THREE.Mesh(new THREE.TubeGeometry(curve, 16, radius, 5), paint));
-  const head = new THREE.Mesh(cone, paint);
-  head.scale.setScalar(3.2 * radius);
-  head.position.copy(curve.getPoint(0.86));
-  head.lookAt(head.position.clone().add(curve.getTangent(0.86)));
-  group.add(head);
-  return { edge, group, paint, middle: curve.getPoint(0.5) };
+// Tubes of three sides, with a cone where a relation has a direction.
+function drawArrows() {
+  const places = [], colours = [], index = [];
+  const first = pointed ?? chosen, parts = 10, place = new THREE.Vector3();
+  middles = [];
+  for (const edge of visibleEdges()) {
+    const curve = curveOf(edge), length = Math.max(curve.getLength(), 1e-3);
+    const radius = Math.min(0.0022 * reach, 0.03 * length);
+    const colour = [...rgb(head.tints[edge.predicate] ?? "#8d93a5"),
+      first === null ? 0.25 + 0.65 * edge.probability ** 2 : 1];
+    const rings = [...Array(parts + 1).keys()].map(step => [step / parts, radius]);
+    if (!edge.mutual) {
+      const tip = 0.9, base = tip - Math.min(10 * radius / length, 0.3);
+      rings.splice(0, Infinity, ...rings.filter(([at]) => at < base), [base, radius],
+        [base, 3.2 * radius], [tip, 0]);
+    }
+    const start = places.length / 3;
+    for (const [at, wide] of rings) {
+      const along = curve.getTangent(at), side = along.clone().cross(camera.up);
+      if (side.length() < 1e-3) side.set(1, 0, 0);
+      side.normalize();
+      const up = side.clone().cross(along);
+      for (let corner = 0; corner < 3; corner++) {
+        const angle = 2 * Math.PI * corner / 3;
+        curve.getPoint(at, place).addScaledVector(side, wide * Math.cos(angle))
+          .addScaledVector(up, wide * Math.sin(angle));
+        places.push(place.x, place.y, place.z);
+        colours.push(...colour);
+      }
+    }
+    for (let ring = start; ring < places.length / 3 - 3; ring += 3)
+      for (let corner = 0; corner < 3; corner++) {
+        const a = ring + corner, b = ring + (corner + 1) % 3;
+        index.push(a, b, a + 3, b, b + 3, a + 3);
+      }
+    middles.push([edge, curve.getPoint(0.5)]);
+  }
+  fill(layers.arrows, places, colours, index);
+}
+
+// The way of the camera, and the pyramid of what it sees.
+function drawCamera() {
+  const places = [], colours = [];
+  if (!hiddenKinds.has("camera")) {
+    for (let at = 1; at < path.length; at++) places.push(...path[at - 1], ...path[at]);
+    if (eye !== null) {
+      const { centre, axes: [right, down, forward] } = eye;
+      const depth = 0.08 * reach, high = Math.tan(eye.fov / 2), wide = high * eye.aspect;
+      const corner = (x, y) => centre.map((value, at) =>
+        value + depth * (forward[at] + x * wide * right[at] + y * high * down[at]));
+      const corners = [corner(-1, -1), corner(1, -1), corner(1, 1), corner(-1, 1)];
+      corners.forEach((place, at) =>
+        places.push(...centre, ...place, ...place, ...corners[(at + 1) % 4]));
+    }
+    const colour = rgb("#d9822b");
+    for (let at = 0; at < places.length; at += 3) colours.push(...colour, 0.8);
+  }
+  fill(layers.camera, places, colours);
 }
 
 // Everything that is drawn is between these corners.
-const low = new THREE.Vector3(Infinity, Infinity, Infinity);
-const high = low.clone().negate();
-for (const { centre, size } of graph.nodes) {
-  const half = Math.hypot(...size) / 2;
-  low.min(new THREE.Vector3(...centre).addScalar(-half));
-  high.max(new THREE.Vector3(...centre).addScalar(half));
-}
-for (const place of graph.path) {
-  low.min(new THREE.Vector3(...place));
-  high.max(new THREE.Vector3(...place));
-}
-if (low.x > high.x) { low.set(-1, -1, 0); high.set(1, 1, 1); }
-const room = high.clone().sub(low);
-const reach = Math.max(room.x, room.y, room.z, 0.5);
+const low = new THREE.Vector3(), high = new THREE.Vector3();
+let reach = 1, floor = null, fitted = 0, isMoved = false;
 
-const boxes = graph.nodes.map(boxOf);
-const clouds = cloudsOf(graph.points);
-const arrows = graph.edges.map(arrowOf);
-for (const part of [...boxes, ...arrows]) scene.add(part.group);
-for (const cloud of clouds) scene.add(cloud);
-
-// Lines on the floor, a metre apart.
-const cells = Math.min(2 * Math.ceil(reach / 2) + 2, 200);
-const floor = new THREE.GridHelper(cells, cells);
-floor.rotateX(Math.PI / 2);
-floor.position.set(Math.round((low.x + high.x) / 2), Math.round((low.y + high.y) / 2), low.z);
-scene.add(floor);
-
-if (graph.path.length > 1) {
-  const shape = new THREE.BufferGeometry();
-  shape.setAttribute("position", new THREE.Float32BufferAttribute(graph.path.flat(), 3));
-  scene.add(new THREE.Line(shape, new THREE.LineBasicMaterial({ color: 0x8d93a5 })));
+function measure() {
+  low.set(Infinity, Infinity, Infinity);
+  high.set(-Infinity, -Infinity, -Infinity);
+  for (const { centre, size } of nodes.values()) {
+    const half = Math.hypot(...size) / 2;
+    low.min(new THREE.Vector3(...centre).addScalar(-half));
+    high.max(new THREE.Vector3(...centre).addScalar(half));
+  }
+  for (const place of path) {
+    low.min(new THREE.Vector3(...place));
+    high.max(new THREE.Vector3(...place));
+  }
+  if (low.x > high.x) { low.set(-1, -1, 0); high.set(1, 1, 1); }
+  const room = high.clone().sub(low);
+  reach = Math.max(room.x, room.y, room.z, 0.5);
+  // Lines on the floor, a metre apart.
+  const cells = Math.min(2 * Math.ceil(reach / 2) + 2, 200);
+  if (floor?.cells !== cells) {
+    if (floor) { scene.remove(floor); floor.geometry.dispose(); }
+    floor = new THREE.GridHelper(cells, cells);
+    floor.cells = cells;
+    floor.rotateX(Math.PI / 2);
+    scene.add(floor);
+    recolour();
+  }
+  floor.position.set(Math.round((low.x + high.x) / 2), Math.round((low.y + high.y) / 2), low.z);
+  // A live view follows what grows until the user moves it.
+  if (!isMoved && Math.abs(reach - fitted) > 0.03 * fitted) home();
 }
 
 function home() {
+  fitted = reach;
+  isMoved = false;
   controls.target.copy(low).add(high).multiplyScalar(0.5);
   camera.position.copy(controls.target).add(
-    new THREE.Vector3(-0.1, -0.85, 0.75).multiplyScalar(reach));
+    new THREE.Vector3(-0.1, -0.85, 0.75).multiplyScalar(reach * Math.max(1, 0.9 / camera.aspect)));
+  controls.update();
 }
 
-// --- labels: those that would cover another one are left out ----------------------------------
+// Behind the camera, looking where it looks.
+function follow() {
+  if (hiddenKinds.has("follow") || eye === null) return;
+  const [, down, forward] = eye.axes.map(axis => new THREE.Vector3(...axis));
+  const centre = new THREE.Vector3(...eye.centre);
+  controls.target.copy(centre).addScaledVector(forward, 1.5);
+  camera.position.copy(centre).addScaledVector(forward, -1.2).addScaledVector(down, -0.6);
+  controls.update();
+}
+
+function recolour() {
+  if (floor === null) return;
+  const style = getComputedStyle(document.documentElement);
+  floor.material.vertexColors = false;
+  floor.material.color.set(style.getPropertyValue("--grid").trim());
+  floor.material.needsUpdate = true;
+  draw();
+}
+
+// --- labels: those that would cover another one are left out; the farther, the paler ---------------
 
 const labels = byId("labels");
 const taken = [];
@@ -167,12 +314,14 @@ function put(text, place, className, colour) {
   taken.push(box);
   const label = element("span", className, text);
   label.style.transform = `translate(${x}px, ${y}px) translate(-50%, -50%)`;
+  if (!className.includes("strong"))
+    label.style.opacity = Math.min(1, Math.max(0.5,
+      1.9 - place.distanceTo(camera.position) / camera.position.distanceTo(controls.target)));
   if (colour) label.style.color = colour;
   labels.append(label);
 }
 
 const top_ = node => new THREE.Vector3(...node.centre).setZ(node.centre[2] + node.size[2] / 2);
-const bySight = [...graph.nodes].sort((a, b) => b.observations - a.observations);
 
 function drawLabels() {
   labels.replaceChildren();
@@ -181,59 +330,42 @@ function drawLabels() {
   const first = pointed ?? chosen;
   if (first !== null) {
     put(name(first), top_(nodes.get(first)), "strong");
-    for (const { edge, middle } of arrows)
-      if (isOf(edge, first) && showsEdge(edge)) put(edge.predicate, middle, "predicate strong");
+    for (const [edge, middle] of middles) put(edge.predicate, middle, "predicate strong");
   }
-  for (const node of bySight)
-    if (node.id !== first && showsNode(node)) put(name(node.id), top_(node), "");
-  if (first === null && !hiddenKinds.has("relations"))
-    for (const { edge, middle } of arrows)
-      if (showsEdge(edge)) put(edge.predicate, middle, "predicate", graph.tints[edge.predicate]);
+  for (const node of visibleNodes().sort((a, b) => b.observations - a.observations))
+    if (node.id !== first) put(name(node.id), top_(node), node.sure ? "" : "unsure");
+  if (first === null)
+    for (const [edge, middle] of middles)
+      put(edge.predicate, middle, "predicate", head.tints[edge.predicate]);
 }
 
-// --- drawing -------------------------------------------------------------------------------------
+// --- drawing: what changed, at the next picture of the screen ---------------------------------------
 
+const due = new Set();
 let isDue = false;
-function draw() {
+
+function draw(...parts) {
+  parts.forEach(part => due.add(part));
   if (isDue) return;
   isDue = true;
   requestAnimationFrame(() => {
     isDue = false;
+    const parts = new Set(due);
+    due.clear();
+    if (parts.has("all")) measure();
+    if (parts.has("all") || parts.has("choice")) {
+      drawBoxes();
+      drawArrows();
+      drawPoints();
+      fillList();
+      showCard(pointed ?? chosen);
+      showEmpty();
+    } else if (parts.has("points")) drawPoints();
+    if (parts.has("all") || parts.has("choice") || parts.has("camera")) drawCamera();
+    if (parts.has("camera")) follow();
     renderer.render(scene, camera);
     drawLabels();
   });
-}
-
-function refresh() {
-  const first = pointed ?? chosen;
-  const isNear = id => first === null || id === first ||
-    graph.edges.some(edge => isOf(edge, first) && isOf(edge, id) && showsEdge(edge));
-  boxes.forEach(({ node, group, body, rim }, row) => {
-    group.visible = !hiddenKinds.has("boxes") && showsNode(node);
-    clouds[row].visible = !hiddenKinds.has("points") && showsNode(node);
-    body.material.opacity = node.id === first ? 0.4 : isNear(node.id) ? 0.16 : 0.05;
-    rim.material.opacity = isNear(node.id) ? (node.sure ? 0.95 : 0.45) : 0.2;
-  });
-  for (const { edge, group, paint } of arrows) {
-    group.visible = !hiddenKinds.has("relations") && showsEdge(edge) &&
-      (first === null || isOf(edge, first));
-    paint.opacity = first === null ? 0.25 + 0.65 * edge.probability ** 2 : 1;
-  }
-  for (const item of document.querySelectorAll("#list li.object")) {
-    const id = Number(item.dataset.id);
-    item.classList.toggle("chosen", id === chosen);
-    item.classList.toggle("off", !showsNode(nodes.get(id)));
-  }
-  showCard(first);
-  draw();
-}
-
-function recolour() {
-  const style = getComputedStyle(document.documentElement);
-  floor.material.vertexColors = false;
-  floor.material.color.set(style.getPropertyValue("--grid").trim());
-  floor.material.needsUpdate = true;
-  draw();
 }
 
 function choose(id) {
@@ -245,18 +377,24 @@ function choose(id) {
     away.setLength(Math.min(away.length(), Math.max(1.2, 4 * Math.max(...node.size))));
     controls.target.copy(target);
     camera.position.copy(target).add(away);
+    isMoved = true;
     controls.update();
   }
-  refresh();
+  draw("choice");
 }
 
 // --- the card of an object -----------------------------------------------------------------------
 
+const HINT = matchMedia("(hover: hover)").matches
+  ? "Point at a box to see its relations. Click it to keep them, Esc to let go."
+  : "Touch a box to see its relations.";
+const opened = new Set();  // relations whose reasons are shown
+
 function showCard(id) {
   const card = byId("card");
   if (id === null) {
-    card.replaceChildren(element("span", "hint", graph.nodes.length
-      ? "Point at a box to see its relations. Click it to keep them, Esc to let go." : ""));
+    card.replaceChildren(element("span", "hint", nodes.size
+      ? HINT : ""));
     return;
   }
   const node = nodes.get(id), facts = element("dl");
@@ -270,21 +408,54 @@ function showCard(id) {
     ["size", `${node.sizeWords.join(" × ")} cm`],
     ["colour", node.looks],
     ["position", `${node.position.map(value => value.toFixed(2)).join(", ")} m`],
-    ["seen in", `${node.observations} frame${node.observations === 1 ? "" : "s"}`],
+    ["seen in", plural(node.observations, "frame")],
   ]) if (text !== null) facts.append(element("dt", "", term), element("dd", "", text));
   const list = element("ul");
-  for (const edge of graph.edges.filter(edge => isOf(edge, id) && showsEdge(edge))) {
-    const line = element("li");
-    line.append(name(edge.subject), " ", element("b", "", edge.verb), " ", name(edge.object),
-      " ", element("span", "quiet", `${percent(edge.probability)}, ${SOURCES[edge.provenance]}`));
-    line.onclick = () => choose(edge.subject === id ? edge.object : edge.subject);
-    list.append(line);
+  for (const edge of edges.values())
+    if (isOf(edge, id) && showsEdge(edge)) list.append(relationItem(edge, id));
+  const title = element("h2", "", name(id)), parts = [title, facts, list];
+  if (node.words) parts.splice(1, 0, element("p", "hint", node.words));
+  if (id === chosen) {
+    const close = element("button", "close", "×");
+    close.title = "let go (Esc)";
+    close.onclick = () => choose(null);
+    title.append(close);
   }
-  card.replaceChildren(element("h2", "", name(id)), facts, list);
+  if (photos.has(id)) {
+    const photo = element("img", "photo");
+    photo.alt = "best view of the object";
+    photo.src = `${location.pathname}/photo/${id}?${photos.get(id)}`;
+    parts.splice(1, 0, photo);
+  }
+  card.replaceChildren(...parts);
 }
 
 const SOURCES = { visual: "seen", prior: "judged by the world model",
   fused: "seen, and judged by the world model", operator: "said by an operator" };
+
+function relationItem(edge, id) {
+  const line = element("li"), more = element("details"), key = keyOf(edge);
+  const other = edge.subject === id ? edge.object : edge.subject;
+  const link = element("a", "", name(other)), summary = element("summary");
+  link.onclick = event => { event.preventDefault(); choose(other); };
+  const ends = [edge.subject, edge.object].map(end => end === id ? name(end) : link);
+  summary.append(ends[0], " ", element("b", "", head.verbs[edge.predicate]), " ", ends[1], " ",
+    element("span", "quiet", `${percent(edge.probability)}, ${SOURCES[edge.provenance]}`));
+  more.open = opened.has(key);
+  const show = async () => {
+    more.open ? opened.add(key) : opened.delete(key);
+    if (!more.open || more.childElementCount > 1) return;
+    const lines = edge.why ?? (isLive ? await (await fetch(
+      `${location.pathname}/why/${edge.subject}/${edge.object}`)).json()
+      : ["this page has no more of it; the command `deworldsg explain` has"]);
+    more.append(...lines.map(text => element("div", "hint", text)));
+  };
+  more.ontoggle = show;
+  more.append(summary);
+  if (more.open) show();
+  line.append(more);
+  return line;
+}
 
 // --- filters and list ----------------------------------------------------------------------------
 
@@ -294,7 +465,7 @@ for (const kind of ["object", "relation"]) {
     least[kind] = slider.value / 100;
     shown.textContent = `${slider.value}\u00a0%`;
   };
-  slider.oninput = () => { apply(); refresh(); };
+  slider.oninput = () => { apply(); draw("choice"); };
   apply();
 }
 
@@ -303,65 +474,101 @@ function toggle(set, key, colour) {
   box.type = "checkbox";
   box.checked = !set.has(key);
   if (colour) box.style.accentColor = colour;
-  box.onchange = () => { box.checked ? set.delete(key) : set.add(key); refresh(); };
+  box.onchange = () => { box.checked ? set.delete(key) : set.add(key); draw("choice"); };
   return box;
 }
 
-for (const [predicate, tint] of Object.entries(graph.tints)) {
-  const count = graph.edges.filter(edge => edge.predicate === predicate).length;
-  const label = element("label");
-  label.append(toggle(hiddenPredicates, predicate, tint), predicate, " ",
-    element("span", "quiet", count));
-  byId("predicates").append(label);
+function fillPredicates() {
+  const counts = new Map();
+  for (const edge of edges.values())
+    if (!isDouble(edge)) counts.set(edge.predicate, (counts.get(edge.predicate) ?? 0) + 1);
+  replaceIfNew(byId("predicates"), [...counts].sort(([a], [b]) => a < b ? -1 : 1),
+    ([predicate, count]) => {
+      const label = element("label");
+      label.append(toggle(hiddenPredicates, predicate, head.tints[predicate]), predicate, " ",
+        element("span", "quiet", count));
+      return label;
+    });
 }
 
-for (const box of document.querySelectorAll("#switches input"))
-  box.onchange = () => {
-    box.checked ? hiddenKinds.delete(box.dataset.kind) : hiddenKinds.add(box.dataset.kind);
-    refresh();
-  };
+// Elements that a user may be about to click are made anew only if their content is another.
+function replaceIfNew(parent, values, make) {
+  const content = JSON.stringify(values);
+  if (parent.content === content) return;
+  parent.content = content;
+  parent.replaceChildren(...values.map(make));
+}
 
-function objectItem(node) {
+for (const box of document.querySelectorAll("#switches input")) {
+  const kind = box.dataset.kind;
+  box.checked = !hiddenKinds.has(kind);
+  box.onchange = () => {
+    box.checked ? hiddenKinds.delete(kind) : hiddenKinds.add(kind);
+    if (kind === "camera") {
+      byId("camera").hidden = !box.checked || !byId("camera").src;
+      tell({ images: box.checked });
+    }
+    draw("choice", "camera");
+  };
+}
+
+function fillList() {
+  const sought = byId("search").value.trim().toLowerCase(), groups = new Map();
+  for (const node of nodes.values())
+    if (name(node.id).toLowerCase().includes(sought))
+      groups.set(node.label, [...(groups.get(node.label) || []), node]);
+  const rows = [...groups.keys()].sort().flatMap(label => [
+    { label, count: groups.get(label).length, colour: head.colours[label] },
+    ...groups.get(label).map(node => ({ id: node.id, text: name(node.id),
+      belief: percent(node.probability), colour: head.colours[label] })),
+  ]);
+  replaceIfNew(byId("list"), rows, row => row.id === undefined ? classItem(row) : objectItem(row));
+  for (const item of document.querySelectorAll("#list li.object")) {
+    const id = Number(item.dataset.id);
+    item.classList.toggle("chosen", id === chosen);
+    item.classList.toggle("off", !showsNode(nodes.get(id)));
+  }
+  fillPredicates();
+}
+
+function classItem({ label, count, colour }) {
+  const header = element("li", "class"), text = element("label", "name");
+  text.append(toggle(hiddenClasses, label, colour), label);
+  header.append(text, element("span", "quiet", count));
+  return header;
+}
+
+function objectItem({ id, text, belief, colour }) {
   const item = element("li", "object"), dot = element("span", "dot");
-  item.dataset.id = node.id;
-  dot.style.background = node.colour;
-  item.append(dot, element("span", "name", name(node.id)),
-    element("span", "quiet", percent(node.probability)));
-  item.onclick = () => choose(node.id);
-  item.onmouseenter = () => { pointed = node.id; refresh(); };
-  item.onmouseleave = () => { pointed = null; refresh(); };
+  item.dataset.id = id;
+  dot.style.background = colour;
+  item.append(dot, element("span", "name", text), element("span", "quiet", belief));
+  item.onclick = () => choose(id);
+  item.onmouseenter = () => { pointed = id; draw("choice"); };
+  item.onmouseleave = () => { pointed = null; draw("choice"); };
   return item;
 }
 
-function fillList(filter) {
-  const groups = new Map();
-  for (const node of graph.nodes)
-    if (name(node.id).toLowerCase().includes(filter))
-      groups.set(node.label, [...(groups.get(node.label) || []), node]);
-  byId("list").replaceChildren(...[...groups.keys()].sort().flatMap(label => {
-    const members = groups.get(label), header = element("li", "class"), text = element("label", "name");
-    text.append(toggle(hiddenClasses, label, members[0].colour), label);
-    header.append(text, element("span", "quiet", members.length));
-    return [header, ...members.map(objectItem)];
-  }));
-}
-
-byId("search").oninput = event => { fillList(event.target.value.trim().toLowerCase()); refresh(); };
+byId("search").oninput = () => draw("choice");
+// On a phone the panel gives way to the scene until its title is touched.
+document.querySelector("header").onclick = () => byId("side").classList.toggle("open");
 
 // --- an empty graph says why ---------------------------------------------------------------------
 
-if (!graph.nodes.length) {
-  const why = element("div"), reasons = Object.entries(graph.hidden);
-  why.id = "empty";
-  why.append(element("h2", "", "No objects in this graph."));
-  if (reasons.length) {
+function showEmpty() {
+  byId("empty").hidden = nodes.size > 0;
+  if (nodes.size) return;
+  const parts = [element("h2", "", "No objects in this graph.")];
+  const reasons = Object.entries(head.hidden);
+  if (isLive) parts.push(element("p", "", head.why));
+  else if (reasons.length) {
     const list = element("ul");
     for (const [reason, count] of reasons) list.append(element("li", "", `${count}: ${reason}`));
-    why.append(element("p", "", "These were detected, and are not in the graph:"), list);
-  } else why.append(element("p", "", "Nothing was detected. The detector may not know what is in " +
+    parts.push(element("p", "", "These were detected, and are not in the graph:"), list);
+  } else parts.push(element("p", "", "Nothing was detected. The detector may not know what is in " +
     "view, or depth or poses may be missing. The command `deworldsg doctor RECORDING` looks for " +
     "the cause."));
-  view.append(why);
+  byId("empty").replaceChildren(...parts);
 }
 
 // --- pointer, keys, size -------------------------------------------------------------------------
@@ -369,36 +576,54 @@ if (!graph.nodes.length) {
 const caster = new THREE.Raycaster();
 let pressed = null;
 
+// Whether a ray meets a box, in the axes of the box.
+function meets({ origin, direction }, { centre, axes, size }) {
+  let enter = 0, leave = Infinity;
+  for (let side = 0; side < 3; side++) {
+    const axis = new THREE.Vector3(...axes.slice(3 * side, 3 * side + 3));
+    const start = origin.clone().sub(new THREE.Vector3(...centre)).dot(axis);
+    const speed = direction.dot(axis), half = Math.max(size[side], 0.005) / 2;
+    const [a, b] = [(-half - start) / speed, (half - start) / speed].sort((p, q) => p - q);
+    if (Number.isNaN(a)) return false;
+    enter = Math.max(enter, a);
+    leave = Math.min(leave, b);
+  }
+  return enter <= leave;
+}
+
 function under(event) {
   const frame = renderer.domElement.getBoundingClientRect();
   caster.setFromCamera(new THREE.Vector2(
     2 * (event.clientX - frame.left) / frame.width - 1,
     1 - 2 * (event.clientY - frame.top) / frame.height), camera);
-  const shown = boxes.filter(box => box.group.visible).map(box => box.body);
-  const hits = caster.intersectObjects(shown, false).map(hit => hit.object.userData.id);
+  const hits = hiddenKinds.has("boxes") ? []
+    : visibleNodes().filter(node => meets(caster.ray, node));
   // A cup inside the box of a table: the smallest box under the pointer is meant.
-  const volume = id => nodes.get(id).size.reduce((a, b) => a * b, 1);
-  return hits.length ? hits.reduce((a, b) => volume(b) < volume(a) ? b : a) : null;
+  const volume = node => node.size.reduce((a, b) => a * b, 1);
+  return hits.length ? hits.reduce((a, b) => volume(b) < volume(a) ? b : a).id : null;
 }
 
 renderer.domElement.addEventListener("pointermove", event => {
   if (event.buttons || event.pointerType === "touch") return;
   const id = under(event);
-  if (id !== pointed) { pointed = id; refresh(); }
+  if (id !== pointed) { pointed = id; draw("choice"); }
 });
 renderer.domElement.addEventListener("pointerdown", event => {
   pressed = [event.clientX, event.clientY];
 });
 renderer.domElement.addEventListener("pointerup", event => {
+  if (pressed === null) return;
   const moved = Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]);
   if (moved < 5) choose(under(event));
+  else isMoved = true;
 });
+renderer.domElement.addEventListener("wheel", () => { isMoved = true; }, { passive: true });
 document.addEventListener("keydown", event => {
   if (event.key !== "Escape") return;
-  if (chosen === null && pointed === null) { home(); controls.update(); }
+  if (chosen === null && pointed === null) home();
   choose(null);
 });
-controls.addEventListener("change", draw);
+controls.addEventListener("change", () => draw());
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolour);
 
 new ResizeObserver(() => {
@@ -407,15 +632,90 @@ new ResizeObserver(() => {
   renderer.domElement.style.width = renderer.domElement.style.height = "100%";
   camera.aspect = view.clientWidth / Math.max(view.clientHeight, 1);
   camera.updateProjectionMatrix();
+  if (!isMoved) home();
   draw();
 }).observe(view);
 
-const plural = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
-byId("title").textContent =
-  `${plural(graph.nodes.length, "object")}, ${plural(graph.edges.length, "relation")}`;
-byId("subtitle").textContent = `world frame “${graph.frame_id}”`;
-fillList("");
-home();
-controls.update();
-recolour();
-refresh();
+// --- messages: what changed -----------------------------------------------------------------------
+
+function apply(message) {
+  if (message.head) head = message.head;
+  for (const id of message.removed ?? [])
+    for (const map of [nodes, clouds, photos]) map.delete(id);
+  for (const [subject, object] of message.removedEdges ?? []) edges.delete(`${subject} ${object}`);
+  for (const node of message.nodes ?? []) nodes.set(node.id, node);
+  for (const edge of message.edges ?? []) edges.set(keyOf(edge), edge);
+  for (const cloud of message.clouds ?? []) clouds.set(cloud.id, pointsOf(cloud));
+  for (const [id, stamp] of Object.entries(message.photos ?? {})) photos.set(Number(id), stamp);
+  if (message.path) path = path.slice(0, message.from ?? 0).concat(message.path);
+  if (message.camera) eye = message.camera;
+  if (!nodes.has(chosen)) chosen = null;
+  if (!nodes.has(pointed)) pointed = null;
+  const count = [...edges.values()].filter(edge => !isDouble(edge)).length;
+  byId("title").textContent = `${plural(nodes.size, "object")}, ${plural(count, "relation")}`;
+  byId("subtitle").textContent = head.frame_id ? `world frame “${head.frame_id}”` : "";
+  if (message.head?.moments) showMoments(head.moments);
+  if (message.head || message.nodes || message.removed || message.edges || message.removedEdges)
+    draw("all");
+  if (message.clouds) draw("points");
+  if (message.path || message.camera) draw("camera");
+}
+
+function pointsOf({ from, mm }) {
+  const bytes = Uint8Array.from(atob(mm), character => character.charCodeAt(0));
+  const steps = new Int16Array(bytes.buffer), points = new Float32Array(steps.length);
+  for (let at = 0; at < steps.length; at++) points[at] = from[at % 3] + steps[at] / 1000;
+  return points;
+}
+
+// --- live: the socket, the camera's image, the time -----------------------------------------------
+
+let socket = null, moment = null;
+const tell = wish => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(wish)); };
+
+function connect() {
+  socket = new WebSocket(location.href.replace(/^http/, "ws"));
+  socket.binaryType = "blob";
+  socket.onopen = () => {
+    // The server begins anew: what it does not send is gone.
+    for (const map of [nodes, edges, clouds, photos]) map.clear();
+    path = [];
+    byId("lost").hidden = true;
+    tell({ images: !hiddenKinds.has("camera"), moment });
+  };
+  socket.onmessage = ({ data }) => {
+    if (typeof data === "string") { apply(JSON.parse(data)); return; }
+    const image = byId("camera"), old = image.src;
+    image.src = URL.createObjectURL(data);
+    image.hidden = hiddenKinds.has("camera");
+    if (old) URL.revokeObjectURL(old);
+  };
+  socket.onclose = () => {
+    byId("lost").hidden = false;
+    setTimeout(connect, 2000);
+  };
+}
+
+function showMoments({ first, last, shown, late_s }) {
+  const slider = byId("moment");
+  byId("time").hidden = last <= first;
+  [slider.min, slider.max] = [first, last];
+  if (moment === null) slider.value = last;
+  byId("late").textContent = shown === null ? "now" : `${late_s} s ago`;
+  byId("newest").hidden = moment === null;
+}
+
+function goTo(wanted) {
+  moment = wanted;
+  byId("newest").hidden = moment === null;
+  tell({ moment });
+}
+
+byId("moment").oninput = event =>
+  goTo(event.target.value === event.target.max ? null : Number(event.target.value));
+byId("newest").onclick = () => goTo(null);
+
+document.body.classList.toggle("live", isLive);
+if (isLive) connect();
+else apply(kept);
+draw("all", "camera");

@@ -126,9 +126,16 @@ class Shots:
             old = self._shots[-MOST_IMAGES - 1]
             self._shots[-MOST_IMAGES - 1] = old._replace(image=b"")
 
-    def until(self, stamp_ns: int | None) -> list[Shot]:
-        """Frames up to a time, the oldest first; None = all."""
-        return [shot for shot in self._shots if stamp_ns is None or shot.stamp_ns <= stamp_ns]
+    def last(self, stamp_ns: int | None) -> Shot | None:
+        """The newest frame, not after a time; None = there is none."""
+        return next(
+            (
+                shot
+                for shot in reversed(self._shots)
+                if stamp_ns is None or shot.stamp_ns <= stamp_ns
+            ),
+            None,
+        )
 
 
 # --- Joins the topics of a frame by its stamp: image, masks, objects, and the nodes they became.
@@ -208,6 +215,10 @@ class BestViews:
 
     def __len__(self) -> int:
         return len(self._crops)
+
+    def stamps(self) -> dict[int, int]:
+        """The time of each photo, by node."""
+        return {node_id: crop.stamp_ns for node_id, crop in self._crops.items()}
 
     def add(self, view: CameraView) -> None:
         """Keep the photos of a frame that are better than the known ones."""

@@ -22,8 +22,8 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.view.colours import QUIET, class_colours, to_rgb
 from deworldsg_ros.view.live.camera import CameraView, jpeg, with_masks
-from deworldsg_ros.view.live.details import in_words
 from deworldsg_ros.view.live.state import Guard, up_of
+from deworldsg_ros.view.page import in_words
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import GraphReplica
 

@@ -1,49 +1,50 @@
-"""The live viewer: a page on this machine that follows a graph. Needs the package viser."""
+"""The live viewer: the page of a graph, and a socket that brings it what changes."""
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import io
+import asyncio
+import gzip
+import json
 import logging
+import re
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
 from typing import Any
 
-import numpy as np
-import viser
-import websockets.asyncio.server as websocket_server
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
 
 from deworldsg_ros.base.words import visible
-from deworldsg_ros.graph.extent import horizontal_axes
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.view.live.camera import CameraView
-from deworldsg_ros.view.live.details import object_html
-from deworldsg_ros.view.live.drawing import Label
-from deworldsg_ros.view.live.scene import (
-    ClientLabels,
-    Panel,
-    ViserScene,
-    has_area,
-    overview,
-    set_theme,
-)
-from deworldsg_ros.view.live.state import Guard, LiveState, LogOnce, OnError, up_of
+from deworldsg_ros.view.live.state import Guard, LiveState, LogOnce, OnError, PageView
+from deworldsg_ros.view.page import html_of
 from deworldsg_ros.wire import messages as wire
 
-# Updates come at up to 30 Hz; a browser shows them at this rate, and surface points more seldom.
+# Updates come at up to 30 Hz; a page gets what changed at this rate, or as fast as it reads.
 PERIOD_S = 0.1
-POINTS_PERIOD_S = 1.0
-# Of the view; viser's own 75 degrees distort what is near.
-FOV_RAD = 0.85
-# The view follows the objects if they grow by more than this part of their extent.
-GROWTH = 0.03
-# The browser's camera is exact to less than this.
-MOVED_M = 0.01
 # Frames of the camera that wait to be shown; older ones are left out.
 WAITING_VIEWS = 2
+# A page asks for little.
+MOST_REQUEST_BYTES = 4096
+# More pages at once are refused: each has its own copy of what it was sent.
+MOST_PAGES = 32
+# Only what is in the page runs, and it talks to its own server alone.
+HEADERS = {
+    "Referrer-Policy": "no-referrer",  # it would tell the secret
+    "Cache-Control": "no-store",
+    "X-Frame-Options": "DENY",
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src 'self' blob: data:; connect-src 'self'",
+}
+PHOTO = re.compile(r"/photo/(\d{1,18})")
+WHY = re.compile(r"/why/(\d{1,18})/(\d{1,18})")
 
 
 class Viewer:
@@ -51,14 +52,17 @@ class Viewer:
 
     Args:
         host: address to listen on; 127.0.0.1 = only this machine.
-        port: the next free port from this one on is taken.
+        port: of the page.
         why_empty: shown while there are no objects.
-        on_error: called with each exception of the page's own thread, which goes on; None = the
-            log gets the first one of each type.
+        on_error: called with each exception while a page is served, which goes on; None = the log
+            gets the first one of each type.
 
     Attributes:
         url: of the page, with its secret.
         guard: refuses who does not know the secret.
+
+    Raises:
+        ConfigurationError: if this machine cannot listen there.
     """
 
     def __init__(
@@ -66,31 +70,28 @@ class Viewer:
     ) -> None:
         self._on_error = LogOnce() if on_error is None else on_error
         self.guard = Guard(host, "http")
-        quiet = contextlib.redirect_stdout(io.StringIO())  # viser prints a table
-        with quiet, _guarded(self.guard) as guarded:
-            self._server = viser.ViserServer(host, port, label="DeWorldSG", verbose=False)
-        if not guarded:
-            self._server.stop()
-            raise ConfigurationError(f"viser {viser.__version__} cannot be guarded: expected 1.1")
-        self.url = self.guard.url(self._server.get_port())
+        self.url = self.guard.url(port)
+        self._page = html_of("Scene graph, live", None).encode()
+        self._packed = gzip.compress(self._page)
         self._lock = threading.RLock()
-        self._state = LiveState(why_empty=why_empty)
-        self._views: deque[CameraView] = deque(maxlen=WAITING_VIEWS)
-        self._labels: dict[int, ClientLabels] = {}
-        self._fitted: dict[int, Any] = {}
-        self._changed = threading.Event()
-        self._closed = False
-        self._points_s = 0.0
-        set_theme(self._server, dark=False)
-        self._server.gui.main_panel.dock_right()
-        self._server.initial_camera.fov = FOV_RAD
-        self._scene = ViserScene(self._server, self._select)
-        self._panel = Panel(self._server, self._change, self._fit)
-        self._drawing = self._state.draw()
-        self._changed.set()
-        self._server.on_client_connect(lambda _: self._changed.set())
-        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+        self._state = LiveState(why_empty)
+        self._views: list[CameraView] = []
+        self._wakers: set[asyncio.Event] = set()
+        self._end, self._seen = asyncio.Event(), asyncio.Event()
+        self._loop = asyncio.new_event_loop()
+        listens: Future[None] = Future()
+        self._thread = threading.Thread(
+            target=lambda: self._loop.run_until_complete(self._run(host, port, listens)),
+            name="viewer",
+            daemon=True,
+        )
         self._thread.start()
+        try:
+            listens.result()
+        except OSError as error:
+            raise ConfigurationError(
+                f"cannot listen on host {host}, port {port}: {error}"
+            ) from error
 
     @property
     def session(self) -> str | None:
@@ -104,7 +105,9 @@ class Viewer:
 
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
         """Continue with a snapshot."""
-        self._change(lambda state: state.reset(snapshot))
+        with self._lock:
+            self._state.reset(snapshot)
+        self._wake()
 
     def apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
         """Apply the next update; False for one that is known.
@@ -114,128 +117,144 @@ class Viewer:
         """
         with self._lock:
             applied = self._state.apply(update)
-        self._changed.set()
+        self._wake()
         return applied
 
     def look(self, view: CameraView) -> None:
         """Show a frame of the camera; under load, frames are left out."""
-        self._views.append(view)
-        self._changed.set()
+        with self._lock:
+            self._views = [*self._views, view][-WAITING_VIEWS:]
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._seen.set)
 
     def say(self, why_empty: str) -> None:
         """Change the reason why there are no objects."""
-        self._change(lambda state: setattr(state, "why_empty", why_empty))
+        with self._lock:
+            self._state.why_empty = why_empty
+        self._wake()
 
     def close(self) -> None:
         """End the thread and the page."""
-        self._closed = True
-        self._changed.set()
+        with suppress(RuntimeError):  # it has ended
+            self._loop.call_soon_threadsafe(self._end.set)
         self._thread.join(timeout=5.0)
-        self._server.stop()
 
-    def _change(self, function: Callable[[LiveState], object]) -> None:
-        with self._lock:
-            function(self._state)
-        self._changed.set()
+    def _wake(self) -> None:
+        with suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(self._wake_pages)
 
-    def _select(self, node_id: int) -> None:
-        self._change(lambda state: setattr(state, "selected", node_id))
+    def _wake_pages(self) -> None:
+        for waker in self._wakers:
+            waker.set()
 
-    def _run(self) -> None:
-        while not self._closed:
-            began_s = time.monotonic()
-            # Without a change, only the labels follow the cameras of the browsers.
-            if self._changed.wait(timeout=PERIOD_S):
-                self._changed.clear()
-                self._guarded(self._redraw)
-            self._guarded(self._place_labels)
-            time.sleep(max(began_s + PERIOD_S - time.monotonic(), 0.0))
-
-    def _guarded(self, step: Callable[..., None], *arguments: Any) -> None:
-        """Take a step of the thread. One that fails must not freeze the page of all browsers."""
+    async def _run(self, host: str, port: int, listens: Future[None]) -> None:
         try:
-            step(*arguments)
+            self._server = await serve(
+                self._serve,
+                host,
+                port,
+                process_request=self._answer,
+                max_size=MOST_REQUEST_BYTES,
+                logger=_CONNECTIONS,
+            )
+        except OSError as error:
+            listens.set_exception(error)
+            return
+        listens.set_result(None)
+        watching = asyncio.create_task(self._watch())
+        async with self._server:
+            await self._end.wait()
+            self._server.close()
+        watching.cancel()
+
+    async def _watch(self) -> None:
+        """Take the frames of the camera, whether a page is open or not."""
+        while True:
+            await self._seen.wait()
+            self._seen.clear()
+            await asyncio.to_thread(self._guarded, self._take_views)
+            await asyncio.sleep(PERIOD_S)
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """The page, a photo, or an explanation; None = a socket follows."""
+        path = self.guard.path(request.path, request.headers)
+        if path is None:
+            return connection.respond(403, "open the address that the program printed\n")
+        if "upgrade" in request.headers.get("Connection", "").lower():
+            return None if len(self._wakers) < MOST_PAGES else connection.respond(503, "too many\n")
+        zips = "gzip" in request.headers.get("Accept-Encoding", "")
+        if path == "/":
+            body = self._packed if zips else self._page
+            return _response("text/html; charset=utf-8", body, "gzip" if zips else "")
+        with self._lock:
+            if match := PHOTO.fullmatch(path.partition("?")[0]):
+                photo = self._state.crops[int(match[1])]
+                if photo is not None:
+                    return _response("image/jpeg", photo.image)
+            elif match := WHY.fullmatch(path):
+                lines = self._state.why(int(match[1]), int(match[2]))
+                return _response("application/json", json.dumps(lines).encode())
+        return connection.respond(404, "there is no such page\n")
+
+    async def _serve(self, socket: ServerConnection) -> None:
+        """Bring a page what changed, as fast as it reads, until it goes."""
+        page, waker = PageView(), asyncio.Event()
+        waker.set()
+        self._wakers.add(waker)
+        listening = asyncio.create_task(self._listen(socket, page, waker))
+        try:
+            while True:
+                # Without a change, clouds and images that came too early still follow.
+                with suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(waker.wait(), 1.0)
+                waker.clear()
+                for message in await asyncio.to_thread(self._guarded, self._news, page) or ():
+                    await socket.send(message)
+                await asyncio.sleep(PERIOD_S)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._wakers.discard(waker)
+            listening.cancel()
+
+    async def _listen(self, socket: ServerConnection, page: PageView, waker: asyncio.Event) -> None:
+        """Take what the user of a page chooses; what is no choice is left out."""
+        with suppress(ConnectionClosed):
+            async for text in socket:
+                with suppress(ValueError, AttributeError):
+                    chosen = json.loads(text)
+                    moment = chosen.get("moment", page.moment)
+                    if moment is None or (type(moment) is int and 0 <= moment < 2**53):
+                        page.moment = moment
+                    page.wants_images = bool(chosen.get("images", page.wants_images))
+                    waker.set()
+
+    def _take_views(self) -> None:
+        with self._lock:
+            views, self._views = self._views, []
+            for view in views:
+                self._state.look(view)
+        self._wake()
+
+    def _news(self, page: PageView) -> list[str | bytes]:
+        with self._lock:
+            return self._state.news(page, time.monotonic())
+
+    def _guarded(self, step: Callable[..., Any], *arguments: Any) -> Any:
+        """Take a step; one that fails must not freeze the page. None = it failed."""
+        try:
+            return step(*arguments)
         except Exception as error:
             self._on_error(error)
+            return None
 
-    def _redraw(self) -> None:
-        with self._lock, self._server.atomic():
-            state = self._state
-            while self._views:
-                state.look(self._views.popleft())
-            self._drawing = state.draw()
-            self._scene.show(self._drawing, state.shape)
-            self._draw_surroundings(state)
-            self._draw_points(state)
-            self._panel.show(state, state.summary(self._drawing), self._selected_html(state))
 
-    def _draw_surroundings(self, state: LiveState) -> None:
-        frames = state.frames() if self._panel.camera.value else []
-        self._scene.show_camera(frames)
-        self._panel.show_image(frames[-1].image if frames else b"")
-        bounds = state.bounds()
-        if bounds is not None:
-            self._scene.show_floor(*bounds, state.floor_m(), up_of(state.shown))
-        self._scene.switch_floor(self._panel.floor.value)
-
-    def _draw_points(self, state: LiveState) -> None:
-        """Surface points are large: they follow once a second."""
-        if not self._panel.points.value:
-            self._scene.show_points(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-        elif time.monotonic() - self._points_s > POINTS_PERIOD_S:
-            self._points_s = time.monotonic()
-            self._scene.show_points(*state.points())
-
-    def _selected_html(self, state: LiveState) -> str:
-        if state.selected is None:
-            return ""
-        crop = state.crops[state.selected]
-        return object_html(
-            state.table.objects[state.selected],
-            state.relations_of(state.selected),
-            None if crop is None else crop.image,
-        )
-
-    def _place_labels(self) -> None:
-        clients = self._server.get_clients()
-        self._labels = {key: item for key, item in self._labels.items() if key in clients}
-        labels = self._drawing.labels if self._panel.labels.value else ()
-        for key, client in clients.items():
-            self._guarded(self._place_labels_of, key, client, labels)
-
-    def _place_labels_of(self, key: int, client: Any, labels: Sequence[Label]) -> None:
-        if has_area(client):
-            self._follow_growth(key, client)
-            self._labels.setdefault(key, ClientLabels(client)).show(labels)
-
-    def _follow_growth(self, key: int, client: Any) -> None:
-        """Keep everything in view until the user moves the camera."""
-        with self._lock:
-            bounds = self._state.bounds()
-        if bounds is None:
-            return
-        fitted = self._fitted.get(key)
-        if fitted is not None:
-            position, old, aspect = fitted
-            moved = not np.allclose(client.camera.position, position, atol=MOVED_M)
-            grown_m = np.abs(np.subtract(bounds, old)).max()
-            same = grown_m < GROWTH * np.ptp(old, axis=0).max() and client.camera.aspect == aspect
-            if moved or same:
-                return
-        self._fit(client)
-
-    def _fit(self, client: Any) -> None:
-        with self._lock:
-            bounds, up = self._state.bounds(), up_of(self._state.shown)
-        if bounds is None or not has_area(client):
-            return
-        camera = client.camera
-        aspect = camera.aspect
-        position, target = overview(*bounds, horizontal_axes(up), camera.fov, aspect)
-        with client.atomic():
-            camera.up_direction = up
-            camera.position, camera.look_at = position, target
-        self._fitted[client.client_id] = (position, bounds, aspect)
+def _response(kind: str, body: bytes, encoding: str = "") -> Response:
+    headers = Headers({**HEADERS, "Content-Type": kind, "Content-Length": str(len(body))})
+    headers["Connection"] = "close"
+    if encoding:
+        headers["Content-Encoding"] = encoding
+    return Response(200, "OK", headers, body)
 
 
 class _OneLine(logging.Filter):
@@ -262,45 +281,3 @@ class _OneLine(logging.Filter):
 
 _CONNECTIONS = logging.getLogger(f"{__name__}.connections")
 _CONNECTIONS.addFilter(_OneLine())
-_GUARDING = threading.Lock()
-
-
-@contextlib.contextmanager
-def _guarded(guard: Guard) -> Iterator[list[Guard]]:
-    """The server of viser that is made in the block asks a guard before each page and socket.
-
-    viser has no way to say so. Its constructor returns when `serve` was called in its thread.
-
-    Yields:
-        a list that has the guard afterwards, if it was asked for.
-    """
-    module: Any = websocket_server
-    serve, guarded = module.serve, []
-
-    def guarded_serve(
-        *arguments: Any, process_request: Callable[..., Any] | None = None, **options: Any
-    ) -> Any:
-        if process_request is None:  # not viser's
-            return serve(*arguments, **options)
-
-        def process(connection: Any, request: Any) -> Any:
-            path = guard.path(request.path, request.headers)
-            if path is None:
-                return connection.respond(403, "open the address that the program printed\n")
-            response = process_request(connection, dataclasses.replace(request, path=path))
-            if response is not None:
-                response.headers["Referrer-Policy"] = "no-referrer"  # it would tell the secret
-                response.headers["Cache-Control"] = "no-store"
-                response.headers["X-Frame-Options"] = "DENY"
-            return response
-
-        guarded.append(guard)
-        options["logger"] = _CONNECTIONS
-        return serve(*arguments, process_request=process, **options)
-
-    with _GUARDING:
-        module.serve = guarded_serve
-        try:
-            yield guarded
-        finally:
-            module.serve = serve

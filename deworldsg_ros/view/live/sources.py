@@ -48,7 +48,7 @@ MOST_PORTS = 100
 def open_sink(
     host: str, port: int, why_empty: str, *, foxglove: bool, on_error: OnError | None = None
 ) -> Sink:
-    """A page of viser, or a server for Foxglove.
+    """A page, or a server for Foxglove.
 
     Args:
         host: address to listen on.
@@ -58,7 +58,7 @@ def open_sink(
         on_error: as `Viewer`; the server for Foxglove has no thread of its own.
 
     Raises:
-        ImportError: without the package.
+        ImportError: without the package of Foxglove.
         ConfigurationError: if this machine cannot listen there.
     """
     port = _free_port(host, port or (FOXGLOVE_PORT if foxglove else PAGE_PORT))

@@ -1,36 +1,31 @@
-"""The state of a viewer, without a browser: what was recorded, and what of it is shown to whom."""
+"""The state of the live viewer, without a network: what was recorded, and what is news to whom."""
 
 from __future__ import annotations
 
+import bisect
 import ipaddress
 import logging
+import math
 import secrets
 import socket
 import zlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlsplit
 
+import msgspec
 import numpy as np
 
-from deworldsg_ros.base.words import counted
-from deworldsg_ros.client.objects import Point, Relation, relation_of
-from deworldsg_ros.graph.extent import DEFAULT_UP
+from deworldsg_ros.client.objects import Point, SceneObject, scene_object
+from deworldsg_ros.graph.extent import DEFAULT_UP, surface_points
 from deworldsg_ros.graph.pairs import Pair
-from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
+from deworldsg_ros.scene.arrays import Float32, Float64
+from deworldsg_ros.scene.vocabulary import verb_of
+from deworldsg_ros.view.colours import class_colours, predicate_colours, view_axes
 from deworldsg_ros.view.live.camera import BestViews, CameraView, Shot, Shots, jpeg, with_masks
-from deworldsg_ros.view.live.drawing import (
-    Drawing,
-    Filter,
-    ObjectTable,
-    Shape,
-    draw,
-    node_colours,
-    rgb_of,
-    rotations,
-)
+from deworldsg_ros.view.page import cloud_values, edge_values, path_values, values_of, why
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import GraphReplica
 
@@ -171,46 +166,82 @@ class History:
             self.first += len(self._blocks.pop(0))
 
 
-# --- The state of a viewer, without a browser: what was recorded, and what of it is shown.
+# --- What the pages show: values that are encoded once, and what each page has of them.
 
 # Points of an object that are collected from the frames, if the messages of the graph have none.
 POINTS_OF_OBJECT = 256
 # Points of the scene: more slow down a phone.
 MOST_POINTS = 100_000
-# Hidden predicates that are named above the controls; of more it says the number.
-MOST_NAMES = 3
-# The floor is drawn below the lowest objects, of which a few may be wrong.
-FLOOR_PERCENTILE = 5.0
+# The camera's way has a place every so many metres; a long one loses every second place.
+STEP_M, MOST_PLACES = 0.03, 20_000
+# Surface points and images are large: they follow in these periods.
+CLOUDS_PERIOD_S, IMAGE_PERIOD_S = 1.0, 0.2
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The graph at one moment as the page gets it, in JSON.
+
+    Attributes:
+        nodes, edges: each value by id, or by subject and object. Of an unchanged value, the same
+            bytes.
+        head: what is true of all, but for the moments.
+        stamp_ns: of the graph.
+    """
+
+    nodes: dict[int, bytes]
+    edges: dict[Pair, bytes]
+    head: dict[str, Any]
+    stamp_ns: int
 
 
 @dataclass
+class PageView:
+    """What one page has, and what its user has chosen.
+
+    Attributes:
+        moment: number of the shown moment; None = the newest one.
+        wants_images: whether it shows those of the camera.
+    """
+
+    moment: int | None = None
+    wants_images: bool = True
+    nodes: dict[int, bytes] = field(default_factory=dict)
+    edges: dict[Pair, bytes] = field(default_factory=dict)
+    clouds: dict[int, bytes] = field(default_factory=dict)
+    photos: dict[int, int] = field(default_factory=dict)
+    head: bytes = b""
+    places: tuple[int, int] = (0, 0)
+    camera_ns: int | None = None
+    image_ns: int | None = None
+    clouds_s: float = -math.inf
+    image_s: float = -math.inf
+
+
 class LiveState:
-    """Applies updates and camera views, and draws the moment that is chosen.
+    """Applies updates and frames of the camera, and says what is news for a page.
 
     Attributes:
         history: the graph after each update.
         crops: the best photo of each object.
-        shots: the frames of the camera.
-        filter, shape, selected: what the user chose.
-        moment: number of the shown moment; None = the newest one.
         why_empty: shown while there are no objects.
     """
 
-    history: History = field(default_factory=History)
-    crops: BestViews = field(default_factory=BestViews)
-    shots: Shots = field(default_factory=Shots)
-    filter: Filter = Filter()
-    shape: Shape = "boxes"
-    selected: int | None = None
-    moment: int | None = None
-    why_empty: str = "waiting for the graph"
-
-    def __post_init__(self) -> None:
-        self.table = ObjectTable()
-        self.edges: dict[Pair, wire.EdgeState] = {}
-        self.shown = self.history.newest
-        self._points: dict[int, Float32] = {}
+    def __init__(self, why_empty: str = "waiting for the graph") -> None:
+        self.history = History()
+        self.crops = BestViews()
+        self.why_empty = why_empty
+        self._shots = Shots()
+        self._up: Point | None = None
+        self._items: dict[int, SceneObject] = {}
+        self._nodes: dict[int, bytes] = {}
+        self._edges: dict[Pair, tuple[wire.EdgeState, bytes]] = {}
+        self._predicates: dict[str, int] = {}
         self._colours: dict[int, str] = {}
+        self._points: dict[int, Float32] = {}
+        self._clouds: dict[int, tuple[Any, int, bytes]] = {}
+        self._places: list[tuple[int, Float64]] = []
+        self._redrawn = 0  # how often the places became others
 
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
         """Continue with a snapshot."""
@@ -228,8 +259,9 @@ class LiveState:
     def look(self, view: CameraView) -> None:
         """Take a frame of the camera: its way, its image, photos and points of its objects."""
         self.crops.add(view)
+        self._newest()  # the colours
         image = with_masks(view, self._colours)
-        self.shots.add(
+        self._shots.add(
             Shot(
                 view.stamp_ns,
                 view.T_world_camera,
@@ -238,84 +270,229 @@ class LiveState:
                 b"" if image is None else jpeg(image),
             )
         )
+        place = view.T_world_camera[:3, 3]
+        if not self._places or math.dist(place, self._places[-1][1]) >= STEP_M:
+            self._places.append((view.stamp_ns, place))
+        if len(self._places) > MOST_PLACES:
+            self._places, self._redrawn = self._places[::2], self._redrawn + 1
         if view.local is not None:
             for node_id, points in zip(view.node_ids, view.local.surface_points_world):
                 known = self._points.get(node_id, np.zeros((0, 3), np.float32))
                 self._points[node_id] = np.concatenate([known, points])[-POINTS_OF_OBJECT:]
 
-    def draw(self) -> Drawing:
-        """The drawing of the chosen moment; only what changed is computed again."""
+    def news(self, page: PageView, now_s: float) -> list[str | bytes]:
+        """Messages that bring a page up to date; empty if it is.
+
+        A page that is slow asks seldom: what was between is left out.
+
+        Args:
+            page: what the page has; it is updated.
+            now_s: of a clock that only goes on.
+        """
+        scene = self._newest()
+        if page.moment is not None:
+            replica = self.history.at(page.moment)
+            scene = self._encoded(replica)
+        parts = [
+            *_changes("nodes", "removed", page.nodes, scene.nodes, lambda node_id: node_id),
+            *_changes("edges", "removedEdges", page.edges, scene.edges, list),
+            *self._head_news(page, scene),
+            *self._cloud_news(page, scene, now_s),
+            *self._camera_news(page, scene, now_s),
+        ]
+        texts: list[str | bytes] = [f"{{{','.join(parts)}}}"] if parts else []
+        return texts + self._image_news(page, scene, now_s)
+
+    def why(self, subject: int, object_: int) -> list[str]:
+        """Where the belief in a relation of the newest graph comes from; empty if it is gone."""
+        edge = self.history.newest.edges.get((subject, object_))
+        self._newest()
+        if edge is None or not {subject, object_} <= self._items.keys():
+            return []
+        return why(edge, self._items)
+
+    @property
+    def _axes(self) -> Float64:
+        return view_axes(self._up or DEFAULT_UP)
+
+    def _newest(self) -> Scene:
+        """The newest graph; only what changed is encoded again."""
         newest = self.history.newest
-        self.shown = newest if self.moment is None else self.history.at(self.moment)
-        if self.table.sync(self.shown.nodes, self.shown.frame_id, up_of(self.shown)):
-            self._colours = node_colours(self.table)
-        self.edges = dict(self.shown.edges)
-        if self.selected not in self.table:
-            self.selected = None
-        return draw(self.table, self.edges, self.filter, self.shape, self.selected)
+        if self._up != up_of(newest):  # every value is another
+            self._up = up_of(newest)
+            self._items, self._nodes, self._edges, self._clouds = {}, {}, {}, {}
+            self._redrawn += 1
+        changed = False
+        for node_id in self._items.keys() - newest.nodes.keys():
+            del self._items[node_id], self._nodes[node_id]
+            self._clouds.pop(node_id, None)
+            changed = True
+        for node_id, node in newest.nodes.items():
+            known = self._items.get(node_id)
+            if known is None or known.state is not node:
+                item = scene_object(node, newest.frame_id, self._up)
+                self._items[node_id] = item
+                self._nodes[node_id] = _json(values_of(item, self._axes))
+                changed = True
+        for pair in self._edges.keys() - newest.edges.keys():
+            del self._edges[pair]
+        for pair, edge in newest.edges.items():
+            if pair not in self._edges or self._edges[pair][0] is not edge:
+                self._edges[pair] = edge, _json(edge_values(edge))
+        if changed:
+            colours = class_colours(self._items[i].label for i in sorted(self._items))
+            self._colours = {i: colours[item.label] for i, item in self._items.items()}
+        edges = {
+            pair: text
+            for pair, (_, text) in self._edges.items()
+            if pair[0] in self._nodes and pair[1] in self._nodes
+        }
+        return Scene(self._nodes, edges, self._head(newest, self._items), newest.stamp_ns)
 
-    def points(self) -> tuple[Float32, UInt8]:
-        """Surface points (n, 3) of the drawn objects, and their colours (n, 3)."""
-        parts, tints = [], []
-        for node_id, item in self.table.objects.items():
-            points = item.surface_m if len(item.surface_m) else self._points.get(node_id)
-            if points is not None and len(points) and item.label not in self.filter.hidden_classes:
-                parts.append(np.asarray(points, np.float32))
-                tints.append(self._colours[node_id])
-        if not parts:
-            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
-        points = np.concatenate(parts)
-        colours = np.repeat(rgb_of(tints), [len(part) for part in parts], axis=0)
-        stride = -(-len(points) // MOST_POINTS)
-        return points[::stride], colours[::stride]
-
-    def frames(self) -> list[Shot]:
-        """Frames of the camera up to the shown moment."""
-        return self.shots.until(None if self.moment is None else self.shown.stamp_ns)
-
-    def relations_of(self, node_id: int) -> list[Relation]:
-        """Relations of an object that is drawn, the most probable first."""
-        objects = self.table.objects
-        found = [
-            relation_of(edge, objects[edge.subject], objects[edge.object], None)
-            for pair, edge in self.edges.items()
-            if node_id in pair and pair[0] in objects and pair[1] in objects
-        ]
-        return sorted(found, key=lambda item: -item.probability)
-
-    def summary(self, drawing: Drawing) -> list[str]:
-        """The size of the graph, and the moment; why it is empty."""
-        objects, relations = len(self.table), len(self.edges)
-        if not objects:
-            return ["no objects", self.why_empty]
-        shown = len(drawing.arrows) + len(drawing.lines)
-        hidden = sorted(
-            self.filter.hidden_predicates & {edge.predicate for edge in self.edges.values()}
+    def _encoded(self, replica: GraphReplica) -> Scene:
+        """The graph of an earlier moment."""
+        items = {
+            node_id: scene_object(node, replica.frame_id, self._up or DEFAULT_UP)
+            for node_id, node in replica.nodes.items()
+        }
+        return Scene(
+            {node_id: _json(values_of(item, self._axes)) for node_id, item in items.items()},
+            {
+                pair: _json(edge_values(edge))
+                for pair, edge in replica.edges.items()
+                if pair[0] in items and pair[1] in items
+            },
+            self._head(replica, items),
+            replica.stamp_ns,
         )
-        names = ", ".join(hidden) if len(hidden) <= MOST_NAMES else f"{len(hidden)} predicates"
-        without = f" ({names} {'is' if len(hidden) == 1 else 'are'} hidden)" if hidden else ""
-        lines = [
-            f"{counted(objects, 'object')}, {counted(relations, 'relation')}",
-            f"shown: {counted(len(drawing.ids), 'object')}, {counted(shown, 'relation')}" + without,
-            f"world frame: {self.shown.frame_id}",
-        ]
-        if self.moment is not None:
-            late_s = (self.history.newest.stamp_ns - self.shown.stamp_ns) / 1e9
-            lines.append(f"update {self.shown.sequence}, {late_s:.1f} s before the newest")
-        return lines
 
-    def bounds(self) -> tuple[Float64, Float64] | None:
-        """Lower and upper corner (3,) of what is drawn; None = nothing."""
-        if not len(self.table):
-            return None
-        half = np.einsum("nij,nj->ni", np.abs(rotations(self.table.wxyzs)), self.table.sizes / 2)
-        return (self.table.centres - half).min(axis=0), (self.table.centres + half).max(axis=0)
+    def _head(self, replica: GraphReplica, items: Mapping[int, SceneObject]) -> dict[str, Any]:
+        # A predicate keeps its colour: the first one that came is the first of the palette.
+        for edge in replica.edges.values():
+            self._predicates.setdefault(edge.predicate, -len(self._predicates))
+        return {
+            "colours": class_colours(items[i].label for i in sorted(items)),
+            "tints": predicate_colours(self._predicates),
+            "verbs": {predicate: verb_of(predicate) for predicate in self._predicates},
+            "frame_id": replica.frame_id,
+            "hidden": {},
+            "why": self.why_empty,
+        }
 
-    def floor_m(self) -> float:
-        """Height along up below which few objects reach."""
-        up = np.array(up_of(self.shown))
-        bottoms = self.table.centres @ up - self.table.sizes[:, 2] / 2
-        return float(np.percentile(bottoms, FLOOR_PERCENTILE))
+    def _head_news(self, page: PageView, scene: Scene) -> list[str]:
+        newest_ns = self.history.newest.stamp_ns
+        moments = {
+            "first": self.history.first,
+            "last": self.history.last,
+            "shown": page.moment,
+            "late_s": round((newest_ns - scene.stamp_ns) / 1e9, 1),
+        }
+        head = _json({**scene.head, "moments": moments})
+        if head == page.head:
+            return []
+        page.head = head
+        return [f'"head":{head.decode()}']
+
+    def _cloud_news(self, page: PageView, scene: Scene, now_s: float) -> list[str]:
+        if now_s - page.clouds_s < CLOUDS_PERIOD_S:
+            return []
+        page.clouds_s = now_s
+        clouds = self._encoded_clouds()
+        shown = {node_id: clouds[node_id] for node_id in scene.nodes if node_id in clouds}
+        news = [text for node_id, text in shown.items() if page.clouds.get(node_id) is not text]
+        page.clouds = shown
+        stamps = self.crops.stamps()
+        photos = {node_id: stamps[node_id] for node_id in scene.nodes if node_id in stamps}
+        new = {str(i): stamp for i, stamp in photos.items() if page.photos.get(i) != stamp}
+        page.photos = photos
+        parts = [f'"clouds":{_list(news)}'] if news else []
+        return [*parts, f'"photos":{_json(new).decode()}'] if new else parts
+
+    def _encoded_clouds(self) -> dict[int, bytes]:
+        """Surface points of the newest objects; only what changed is encoded again."""
+        clouds: dict[int, tuple[Any, Float32 | Float64]] = {}
+        for node_id, item in self._items.items():
+            own = surface_points(item.state)
+            seen = self._points.get(node_id)
+            if len(own):
+                clouds[node_id] = item.state, own
+            elif seen is not None:
+                clouds[node_id] = seen, seen
+        stride = max(1, -(-sum(len(points) for _, points in clouds.values()) // MOST_POINTS))
+        for node_id, (source, points) in clouds.items():
+            known = self._clouds.get(node_id)
+            if known is None or known[0] is not source or known[1] != stride:
+                item = self._items[node_id]
+                text = _json(cloud_values(item, points[::stride], self._axes))
+                self._clouds[node_id] = source, stride, text
+        return {node_id: self._clouds[node_id][2] for node_id in clouds}
+
+    def _shot(self, page: PageView, scene: Scene) -> Shot | None:
+        return self._shots.last(None if page.moment is None else scene.stamp_ns)
+
+    def _camera_news(self, page: PageView, scene: Scene, now_s: float) -> list[str]:
+        """The way up to the shown moment, and where the camera is."""
+        count = len(self._places)
+        if page.moment is not None:
+            count = bisect.bisect_right(self._places, scene.stamp_ns, key=lambda item: item[0])
+        redrawn, known = page.places
+        start = min(known, count) if redrawn == self._redrawn else 0
+        parts = []
+        if (self._redrawn, count) != page.places:
+            places = np.array([place for _, place in self._places[start:count]]).reshape(-1, 3)
+            path = _json(path_values(places, self._axes)).decode()
+            parts = [f'"path":{path},"from":{start}']
+            page.places = self._redrawn, count
+        shot = self._shot(page, scene)
+        if shot is not None and shot.stamp_ns != page.camera_ns:
+            page.camera_ns = shot.stamp_ns
+            camera = {
+                "centre": path_values(shot.T_world_camera[None, :3, 3], self._axes)[0],
+                # Columns of the rotation: right, down and forward.
+                "axes": path_values(shot.T_world_camera[:3, :3].T, self._axes),
+                "fov": round(shot.fov_rad, 4),
+                "aspect": round(shot.aspect, 4),
+            }
+            parts.append(f'"camera":{_json(camera).decode()}')
+        return parts
+
+    def _image_news(self, page: PageView, scene: Scene, now_s: float) -> list[str | bytes]:
+        """The image of the camera as a JPEG file."""
+        shot = self._shot(page, scene)
+        if (
+            shot is None
+            or not shot.image
+            or not page.wants_images
+            or page.image_ns == shot.stamp_ns
+            or now_s - page.image_s < IMAGE_PERIOD_S
+        ):
+            return []
+        page.image_ns, page.image_s = shot.stamp_ns, now_s
+        return [shot.image]
+
+
+def _changes(
+    name: str,
+    removed: str,
+    known: dict[Any, bytes],
+    present: Mapping[Any, bytes],
+    key: Callable[[Any], Any],
+) -> list[str]:
+    """The values that a page lacks and those that are gone, as members of a JSON object."""
+    new = [text for at, text in present.items() if known.get(at) != text]
+    gone = [key(at) for at in known if at not in present]
+    for at in [at for at in known if at not in present]:
+        del known[at]
+    known.update(present)
+    parts = [f'"{name}":{_list(new)}'] if new else []
+    return [*parts, f'"{removed}":{_json(gone).decode()}'] if gone else parts
+
+
+def _list(texts: list[bytes]) -> str:
+    return f"[{b','.join(texts).decode()}]"
+
+
+_json = msgspec.json.encode
 
 
 def up_of(replica: GraphReplica) -> Point:

@@ -1,5 +1,6 @@
 """Masks on the image, the best photo of each object, the way of the camera, parts of a frame."""
 
+import json
 from dataclasses import replace
 from itertools import permutations
 
@@ -7,10 +8,11 @@ import cv2
 import numpy as np
 import pytest
 from support.merging import local_graph
+from support.view import make_graph, make_node
 
 from deworldsg_ros.view.live import camera
 from deworldsg_ros.view.live.camera import view_of  # as it is before a fixture replaces it
-from deworldsg_ros.view.live.state import LiveState
+from deworldsg_ros.view.live.state import LiveState, PageView
 from deworldsg_ros.wire import messages as wire
 
 WIDTH, HEIGHT = 640, 480
@@ -88,15 +90,19 @@ def test_the_way_is_kept_and_only_the_newest_images(monkeypatch):
     shots = camera.Shots()
     for stamp_ns in range(6):
         shots.add(camera.Shot(stamp_ns, np.eye(4), 1.0, 1.0, b"image"))
-    assert [bool(shot.image) for shot in shots.until(None)] == [False] * 3 + [True] * 3
-    assert [shot.stamp_ns for shot in shots.until(2)] == [0, 1, 2]
+    found = [shots.last(stamp_ns) for stamp_ns in range(6)]
+    assert [shot.stamp_ns for shot in found] == list(range(6))
+    assert [bool(shot.image) for shot in found] == [False] * 3 + [True] * 3
+    assert shots.last(None) is found[-1] and shots.last(-1) is None
 
 
 def test_points_of_the_frames_stand_in_for_those_of_the_graph():
-    state = LiveState()
+    state, page = LiveState(), PageView()
     state.look(view(((100, 100, 200, 200), 7, 500)))
-    assert len(state.points()[0]) == 0, "not of a node that is not in the graph"
-    assert len(state.frames()) == 1
+    assert "clouds" not in json.loads(state.news(page, 0.0)[0])  # of no node of the graph
+    state.reset(make_graph([make_node(7, "cup")]))
+    message = json.loads(state.news(page, 2.0)[0])
+    assert [cloud["id"] for cloud in message["clouds"]] == [7] and message["photos"] == {"7": 1}
 
 
 def send(joiner, stamp_ns, parts=camera.PARTS, now_s=0.0, decoded=None):

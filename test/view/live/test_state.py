@@ -1,109 +1,196 @@
-"""What the live viewer shows, without a browser: drawing, labels, details, and the past."""
+"""What a page of the live viewer is told, without a network: what changed, the past, and words."""
 
-import math
+import base64
+import json
 
 import numpy as np
 import pytest
 from support.view import box_at, make_edge, make_graph, make_node, random_graphs, updates_of
 
-from deworldsg_ros.client.objects import relation_of, scene_object
-from deworldsg_ros.scene.arrays import shared_areas
+from deworldsg_ros.client.objects import scene_object
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.view.live import scene
-from deworldsg_ros.view.live.details import in_words, object_html, uncertainty
-from deworldsg_ros.view.live.drawing import Filter, Label
-from deworldsg_ros.view.live.state import BLOCK, History, LiveState
+from deworldsg_ros.view.live.camera import CameraView
+from deworldsg_ros.view.live.state import BLOCK, CLOUDS_PERIOD_S, History, LiveState, PageView
+from deworldsg_ros.view.page import in_words
 from deworldsg_ros.wire import messages as wire
 
 UP = (0.0, 0.0, 1.0)
 
 
-def node(node_id, label="cup", center=(0.0, 0.0, 0.0), turned=0.0, **fields):
-    box = box_at(center, (0.2, 0.4, 0.6), turned)
+def node(node_id, label="cup", center=(0.0, 0.0, 0.0), **fields):
+    box = box_at(center, (0.2, 0.4, 0.6))
     return make_node(node_id, label, center, **{"box": box, "existence": 0.95, **fields})
 
 
-def state_of(nodes, edges=(), **chosen):
-    state = LiveState(**chosen)
-    state.reset(make_graph(nodes, edges))
-    return state, state.draw()
+class Page:
+    """A page, as page.js keeps it."""
+
+    def __init__(self, state):
+        self.state, self.view, self.now_s = state, PageView(), 0.0
+        self.nodes, self.edges, self.clouds, self.head, self.path = {}, {}, {}, {}, []
+        self.camera, self.photos, self.images = None, {}, []
+
+    def look(self, after_s=CLOUDS_PERIOD_S):
+        """Take the news; the keys that changed."""
+        self.now_s += after_s
+        messages = self.state.news(self.view, self.now_s)
+        self.images += [item for item in messages if isinstance(item, bytes)]
+        texts = [json.loads(item) for item in messages if isinstance(item, str)]
+        assert len(texts) <= 1
+        message = texts[0] if texts else {}
+        for node_id in message.get("removed", ()):
+            del self.nodes[node_id]
+            self.clouds.pop(node_id, None)
+        for pair in message.get("removedEdges", ()):
+            del self.edges[tuple(pair)]
+        self.nodes |= {item["id"]: item for item in message.get("nodes", ())}
+        self.edges |= {(e["subject"], e["object"]): e for e in message.get("edges", ())}
+        self.clouds |= {item["id"]: item for item in message.get("clouds", ())}
+        self.photos |= message.get("photos", {})
+        self.head = message.get("head", self.head)
+        self.camera = message.get("camera", self.camera)
+        if "path" in message:
+            self.path = self.path[: message["from"]] + message["path"]
+        return set(message)
 
 
-def follow(state, before, after, **fields):
-    """Apply the update from one list of nodes to the next."""
-    graphs = [make_graph(before), make_graph(after, sequence=2, **fields)]
-    state.apply(*updates_of(graphs))
-    return state.draw()
+def shows(page, graph):
+    assert set(page.nodes) == {item.id for item in graph.nodes}
+    assert {i: item["label"] for i, item in page.nodes.items()} == {
+        n.id: n.label for n in graph.nodes
+    }
+    assert set(page.edges) == {(edge.subject, edge.object) for edge in graph.edges}
 
 
 def test_an_empty_graph_says_why():
-    state, drawing = state_of([], why_empty="the camera is covered")
-    assert len(drawing.ids) == len(drawing.outlines) == len(drawing.arrows) == 0
-    assert not drawing.labels
-    assert state.summary(drawing) == ["no objects", "the camera is covered"]
-    assert state.bounds() is None
+    state = LiveState("the camera is covered")
+    page = Page(state)
+    page.look()
+    assert page.head["why"] == "the camera is covered" and not page.nodes
+    state.why_empty = "it is dark"
+    assert page.look() == {"head"} and page.head["why"] == "it is dark"
 
 
-def test_boxes_have_the_corners_of_the_message_and_ellipsoids_the_size_of_the_covariance():
-    _, drawing = state_of([node(1, center=(1, 2, 3), turned=np.pi / 2)])
-    assert len(drawing.outlines) == 12
-    # Turned by 90 degrees, the length of 0.2 m is along y.
-    corners = drawing.outlines.reshape(-1, 3)
-    np.testing.assert_allclose(np.ptp(corners, axis=0), (0.4, 0.2, 0.6), atol=1e-9)
-    lengths = np.linalg.norm(np.diff(drawing.outlines, axis=1)[:, 0], axis=1)
-    np.testing.assert_allclose(np.sort(lengths), np.repeat((0.2, 0.4, 0.6), 4), atol=1e-9)
-    _, drawing = state_of([node(1)], shape="ellipsoids")
-    assert len(drawing.outlines) == 0
-    # make_node: variances of 0.04, 0.01 and 0.0025 square metres; diameters of 4 deviations.
-    np.testing.assert_allclose(np.sort(drawing.scales[0]), (0.2, 0.4, 0.8), atol=1e-9)
+@pytest.mark.parametrize("seed", range(4))
+def test_pages_that_look_often_or_seldom_have_the_newest_graph(seed):
+    graphs = random_graphs(seed, 40, ["cup", "bowl", "chair"], [0.0, 1.0, 2.0])
+    state = LiveState()
+    often, seldom = Page(state), Page(state)
+    for number, (graph, update) in enumerate(zip(graphs[1:], updates_of(graphs))):
+        assert state.apply(update)
+        often.look()
+        shows(often, graph)
+        if number % 13 == 12:
+            seldom.look()
+            shows(seldom, graph)
+    late = Page(state)
+    late.look()
+    shows(late, graphs[-1])
+    assert often.nodes == late.nodes and often.edges == late.edges
+    assert often.look() == set()  # nothing changed, nothing is sent
 
 
-@pytest.mark.parametrize(
-    ("chosen", "ids", "arrows", "lines"),
-    [
-        ({}, [1, 2, 3], 1, 0),
-        ({"hidden_predicates": frozenset()}, [1, 2, 3], 1, 1),  # one line for both directions
-        ({"hidden_predicates": frozenset({"on"})}, [1, 2, 3], 0, 1),
-        ({"hidden_classes": frozenset({"bowl"})}, [1, 3], 0, 0),
-        ({"min_probability": 0.99}, [], 0, 0),
-        ({"min_relation": 0.81}, [1, 2, 3], 0, 0),
-    ],
-)
-def test_filters_hide_objects_and_relations_and_near_at_first(chosen, ids, arrows, lines):
-    nodes = [node(1), node(2, "bowl", (1, 0, 0)), node(3, center=(0, 0, 1))]
-    edges = [make_edge(1, 3, "near"), make_edge(3, 1, "near"), make_edge(1, 2, "on")]
-    _, drawing = state_of(nodes, edges, filter=Filter(**chosen))
-    assert sorted(drawing.ids.tolist()) == ids
-    assert (len(drawing.arrows), len(drawing.lines)) == (arrows, lines)
+def test_only_what_changed_is_sent():
+    nodes = [node(i, center=(i, 0, 0)) for i in range(1, 101)]
+    state = LiveState()
+    before = make_graph(nodes)
+    state.reset(before)
+    page = Page(state)
+    page.look()
+    moved = [*nodes[:-1], node(100, "bowl", center=(100, 1, 0))]
+    assert state.apply(*updates_of([before, make_graph(moved, sequence=2)]))
+    message = json.loads(state.news(page.view, page.now_s)[0])
+    assert [item["id"] for item in message["nodes"]] == [100]
+    assert set(message) == {"head", "nodes"}  # another number of moments, another colour
 
 
-def test_arrows_end_at_boxes_and_opposite_ones_are_apart():
-    nodes = [node(1), node(2, center=(2, 0, 0))]
-    _, drawing = state_of(nodes, [make_edge(1, 2, "behind")])
-    np.testing.assert_allclose(drawing.arrows[0], [(0, 0, 0), (1.9, 0, 0)], atol=1e-9)
-    _, drawing = state_of(nodes, [make_edge(1, 2, "in front of"), make_edge(2, 1, "behind")])
-    there, back = drawing.arrows
-    assert np.linalg.norm(there.mean(axis=0) - back.mean(axis=0)) > 0.05
+def test_each_page_goes_back_in_time_on_its_own():
+    graphs = random_graphs(3, 30, ["cup", "bowl"], [0.0, 1.0, 2.0])
+    state = LiveState()
+    for update in updates_of(graphs):
+        state.apply(update)
+    now, then = Page(state), Page(state)
+    now.look(), then.look()
+    then.view.moment = 9
+    then.look(), now.look()
+    shows(then, graphs[10])
+    shows(now, graphs[-1])
+    assert then.head["moments"]["shown"] == 9 and now.head["moments"]["shown"] is None
+    assert then.head["moments"]["last"] == 29
+    then.view.moment = None
+    then.look()
+    shows(then, graphs[-1])
+    assert then.nodes == now.nodes
 
 
-def test_a_selected_object_is_emphasised_and_forgotten_when_it_goes():
-    nodes = [node(1), node(2, center=(1, 0, 0)), node(3, center=(0, 1, 0))]
-    state, drawing = state_of(nodes, [make_edge(1, 2), make_edge(3, 2)], selected=1)
-    assert drawing.opacities.argmax() == drawing.ids.tolist().index(1)
-    assert (drawing.arrow_colours[0] != drawing.arrow_colours[1]).any()
-    assert max(drawing.labels, key=lambda label: label.weight).key == "object 1"
-    follow(state, nodes, nodes[1:])
-    assert state.selected is None
+def test_values_are_in_axes_with_up_as_z_and_follow_a_new_up():
+    state = LiveState()
+    item = node(1, center=(0.0, 2.0, 0.0), points=[(0.1, 2.0, 0.0)])
+    state.reset(make_graph([item], up=[0.0, 1.0, 0.0]))
+    page = Page(state)
+    page.look()
+    assert page.nodes[1]["centre"] == [0.0, 0.0, 2.0] and page.nodes[1]["position"] == [
+        0.0,
+        2.0,
+        0.0,
+    ]
+    cloud = page.clouds[1]
+    steps = np.frombuffer(base64.b64decode(cloud["mm"]), "<i2")
+    np.testing.assert_allclose(np.array(cloud["from"]) + steps / 1000, (0.1, 0.0, 2.0), atol=1e-3)
+    state.reset(make_graph([item], up=[0.0, 0.0, 1.0], sequence=2))
+    page.look()
+    assert page.nodes[1]["centre"] == [0.0, 2.0, 0.0]
 
 
-def test_surface_points_have_the_colours_of_their_classes():
-    nodes = [node(1, points=[(0, 0, 0), (0.1, 0, 0)]), node(2, "bowl", points=[(1, 0, 0)])]
-    state, _ = state_of(nodes)
-    points, colours = state.points()
-    assert points.shape == colours.shape == (3, 3)
-    assert colours[0].tolist() == colours[1].tolist() != colours[2].tolist()
-    state.filter = Filter(hidden_classes=frozenset({"bowl"}))
-    assert len(state.points()[0]) == 2
+def view_at(stamp_ns, x, **fields):
+    T = np.eye(4)
+    T[0, 3] = x
+    return CameraView(stamp_ns, T, np.zeros((48, 64, 3), np.uint8), **fields)
+
+
+def test_the_way_of_the_camera_its_place_and_its_image():
+    state = LiveState()
+    page = Page(state)
+    for number in range(5):
+        state.look(view_at(10**9 * number, number))
+        page.look()
+        assert page.camera["centre"] == [number, 0, 0] and len(page.path) == number + 1
+    assert len(page.images) == 5 and page.images[0].startswith(b"\xff\xd8")
+    state.look(view_at(5 * 10**9, 4.0))  # it stands still
+    assert page.look() == {"camera"} and len(page.images) == 6
+    page.view.wants_images = False
+    state.look(view_at(6 * 10**9, 5.0))
+    assert page.look() == {"camera", "path", "from"} and len(page.images) == 6
+
+
+def test_a_long_way_is_made_shorter_and_a_page_gets_it_anew(monkeypatch):
+    monkeypatch.setattr("deworldsg_ros.view.live.state.MOST_PLACES", 8)
+    state = LiveState()
+    page = Page(state)
+    for number in range(30):
+        state.look(view_at(number, number))
+        page.look()
+        assert len(page.path) <= 8 and page.path[0] == [0, 0, 0]
+        assert page.path == sorted(page.path)
+
+
+def test_a_relation_is_explained():
+    state = LiveState()
+    state.reset(make_graph([node(1), node(2, "table")], [make_edge(1, 2)]))
+    assert any("80%" in line for line in state.why(1, 2))
+    assert state.why(2, 1) == state.why(7, 8) == []
+
+
+def test_a_predicate_keeps_its_colour_while_others_become_more_frequent():
+    state = LiveState()
+    nodes = [node(i) for i in range(1, 5)]
+    state.reset(make_graph(nodes, [make_edge(1, 2, "on")]))
+    page = Page(state)
+    page.look()
+    first = page.head["tints"]["on"]
+    state.reset(make_graph(nodes, [make_edge(1, i, "behind") for i in (2, 3, 4)], sequence=2))
+    page.look()
+    assert page.head["tints"]["on"] == first != page.head["tints"]["behind"]
 
 
 # --- the past ----------------------------------------------------------------------------------
@@ -137,45 +224,6 @@ def test_a_gap_in_the_history_is_refused_and_a_snapshot_closes_it():
     assert [history.at(moment).sequence for moment in (0, 1)] == [1, 3]
 
 
-# --- labels and the camera ---------------------------------------------------------------------
-
-# Looks along +y, z is up: x right, y down is -z.
-QUAT = np.sqrt([0.5, 0.5, 0, 0]) * [1, -1, 0, 0]
-AHEAD = scene.Camera(np.zeros(3), QUAT, np.pi / 2, 800.0, 600.0)
-
-
-def boxes_of(placed):
-    shifts = {name: np.array((x, y)) for name, x, y in scene.ANCHORS}
-    boxes = []
-    for item in placed:
-        (point,), _ = AHEAD.project(item.label.position[None])
-        width = scene.FRAME_PX + scene.LETTER_PX * len(item.label.text)
-        half = np.array((width, scene.HEIGHT_PX)) / 2
-        centre = point + shifts[item.anchor] * half
-        boxes.append(np.concatenate([centre - half, centre + half]))
-    return np.array(boxes).reshape(-1, 4)
-
-
-@pytest.mark.parametrize("count", [0, 1, 40, 400])
-def test_labels_do_not_overlap(count):
-    rng = np.random.default_rng(count)
-    positions = rng.uniform((-2, 1, -1), (2, 6, 1), (count, 3))
-    labels = [Label(f"{i}", f"object {i}", p, float(i)) for i, p in enumerate(positions)]
-    placed = scene.place(labels, AHEAD, 60)
-    assert len(placed) <= 60 and bool(placed) == bool(count)
-    shared = shared_areas(boxes_of(placed), boxes_of(placed))
-    assert np.abs(shared - np.diag(np.diag(shared))).sum() == pytest.approx(0.0, abs=1e-6)
-
-
-def test_the_heavier_labels_have_the_first_choice_and_none_is_behind_the_camera():
-    def placed_at(y):
-        labels = [Label(f"{i}", "a chair", np.array([0.0, y, 0.0]), float(i)) for i in range(6)]
-        return [(item.label.key, item.anchor) for item in scene.place(labels, AHEAD, 60)]
-
-    assert placed_at(3.0) == [("5", "bottom-center"), ("4", "top-center")]
-    assert placed_at(-3.0) == []
-
-
 # --- details of an object ----------------------------------------------------------------------
 
 
@@ -199,16 +247,3 @@ def item(*classes, remainder=0.0, entropy=None):
 )  # fmt: skip
 def test_doubt_is_said_in_words(classes, remainder, words):
     assert in_words(item(*classes, remainder=remainder)) == words
-
-
-def test_all_that_is_known_is_there():
-    cup = item(("cup", 0.7), ("bowl", 0.2), remainder=0.1, entropy=math.log(2))
-    table = scene_object(make_node(5, "table"), "map", UP)
-    html = object_html(cup, [relation_of(make_edge(13, 5), cup, table, None)], b"\xff\xd8jpeg")
-    for text in (
-        "cup #13", "bowl", "all other classes", "10%", "5 frames", "on table #5", "80%",
-        "seen in 4 frames", "data:image/jpeg;base64,/9hqcGVn", "2.0 equally likely",
-    ):  # fmt: skip
-        assert text in html, text
-    assert uncertainty(item(("cup", 1.0), entropy=0.0)).startswith("certain")
-    assert uncertainty(item(("cup", 1.0))) == ""
