@@ -227,5 +227,4 @@ def _article(noun: str) -> str:
 
 
 def _rounded(values: Any, digits: int) -> list[float]:
-    rounded: list[float] = np.round(np.asarray(values, np.float64), digits).tolist()
-    return rounded
+    return [round(value, digits) for value in np.asarray(values, np.float64).tolist()]

@@ -39,3 +39,17 @@ def test_the_entry_point_runs_a_command_in_the_environment(root_dir, tmp_path):
     command = ["bash", entry, "sh", "-c", 'echo "$PROFILE $1"; exit 7', "x", "a b"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20)
     assert (done.returncode, done.stdout) == (7, "run a b\n")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.skipif(shutil.which("docker") is None, reason="needs docker")
+@pytest.mark.parametrize("name", ["Dockerfile", "Dockerfile.wheels"])
+def test_an_image_is_built_and_runs_the_command(root_dir, name):
+    tag = f"deworldsg_ros_test:{name.lower()}"
+    build = ["docker", "build", "-q", "-f", f"docker/{name}", "-t", tag, "."]
+    subprocess.run(build, cwd=root_dir, check=True, timeout=3000)
+    command = ["docker", "run", "--rm", tag, "deworldsg", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and done.stdout.strip(), done.stderr
+    subprocess.run(["docker", "rmi", tag], timeout=300)

@@ -123,4 +123,6 @@ def test_names_are_text_whatever_they_contain(chromium, tmp_path):
         shown.locator("#card h2", has_text=names[0]).wait_for()
         assert shown.locator("#card summary").count() == len(edges)
         assert len(shown.locator("#list li.object").all_inner_texts()) == len(names)
-        assert shown.evaluate("document.images.length + (hiddenClasses.size)") == 1  # the hidden one
+        assert (
+            shown.evaluate("document.images.length + (hiddenClasses.size)") == 1
+        )  # the hidden one

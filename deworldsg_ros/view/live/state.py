@@ -233,6 +233,7 @@ class LiveState:
         self.why_empty = why_empty
         self._shots = Shots()
         self._up: Point | None = None
+        self._axes = view_axes(DEFAULT_UP)
         self._items: dict[int, SceneObject] = {}
         self._nodes: dict[int, bytes] = {}
         self._edges: dict[Pair, tuple[wire.EdgeState, bytes]] = {}
@@ -311,15 +312,12 @@ class LiveState:
             return []
         return why(edge, self._items)
 
-    @property
-    def _axes(self) -> Float64:
-        return view_axes(self._up or DEFAULT_UP)
-
     def _newest(self) -> Scene:
         """The newest graph; only what changed is encoded again."""
         newest = self.history.newest
         if self._up != up_of(newest):  # every value is another
             self._up = up_of(newest)
+            self._axes = view_axes(self._up)
             self._items, self._nodes, self._edges, self._clouds = {}, {}, {}, {}
             self._redrawn += 1
         changed = False
