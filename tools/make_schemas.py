@@ -20,6 +20,7 @@ sys.path.insert(0, str(ROOT))
 
 from deworldsg_ros.wire import messages as wire  # noqa: E402
 
+DRAFT = "https://json-schema.org/draft/2020-12/schema"
 CLASSES = ["cup", "table", "chair"]
 PREDICATES = ["on", "near", "under"]
 STAMP = wire.Stamp(sec=12, nanosec=300_000_000)
@@ -31,7 +32,7 @@ SESSION = "5f3c0a91b7d2e846"
 
 def message_schema(name: str) -> dict[str, Any]:
     """The JSON Schema of a message. Its `schema.name` is a constant."""
-    schema = wire.json_schema(wire.MESSAGES[name])
+    schema = {"$schema": DRAFT} | msgspec.json.schema(wire.MESSAGES[name])
     version = wire.schema_of(wire.MESSAGES[name]).version
     definition = schema["$defs"][wire.MESSAGES[name].__name__]
     for described in schema["$defs"].values():

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from deworldsg_ros.base.array_file import read_arrays, write_arrays
 from deworldsg_ros.base.files import parse_json, read_regular, write_atomically
 from deworldsg_ros.graph.graph import GlobalGraph
-from deworldsg_ros.scene.arrays import Bool, Float64, Int64, UInt16
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64, UInt8, UInt16
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.checks import checked, holds, within
 from deworldsg_ros.scene.frame_graph import LocalGraph
@@ -26,7 +26,7 @@ from deworldsg_ros.scene.limits import MAX_INT
 # No map of cells is kept. The depth grids of a bounded number of different views are, and a
 # question projects its points into them. So a frame costs nothing, unless it is such a view.
 
-# Views that are kept, the newest: 1.2 MB of 80 x 60 pixels each.
+# Views that are kept, the newest: 3 MB of 80 x 60 pixels each.
 MAX_VIEWS = 128
 # A view differs from another one if the camera has moved so far, or turned so far.
 MOVED_M, TURNED_RAD = 0.25, math.radians(15.0)
@@ -38,6 +38,9 @@ NEAR_M, NEAR_FRACTION = 0.08, 0.03
 MIN_DEPTH_M = 0.1
 
 _NAMES = ("view_depths_mm", "view_poses", "view_cameras", "view_stamps_ns")
+_COLOURS = "view_colours"  # not in files of older releases
+# Of a view without colours.
+GREY = 160
 
 
 class SeenSpace:
@@ -48,6 +51,7 @@ class SeenSpace:
         poses: (k, 4, 4), T_world_camera.
         cameras: (k, 4), fx, fy, cx, cy in pixels of the grid.
         stamps_ns: (k,).
+        colours: (k, h, w, 3) uint8 RGB of the same pixels; `GREY` where the frames had none.
     """
 
     def __init__(self) -> None:
@@ -55,6 +59,7 @@ class SeenSpace:
         self.poses: Float64 = np.zeros((0, 4, 4))
         self.cameras: Float64 = np.zeros((0, 4))
         self.stamps_ns: Int64 = np.zeros(0, np.int64)
+        self.colours: UInt8 = np.zeros((0, 0, 0, 3), np.uint8)
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -67,6 +72,7 @@ class SeenSpace:
         if grid.depth_mm.shape != self.depths_mm.shape[1:]:  # of another camera
             self.__init__()  # type: ignore[misc]
             self.depths_mm = self.depths_mm.reshape(0, *grid.depth_mm.shape)
+            self.colours = self.colours.reshape(0, *grid.depth_mm.shape, 3)
         camera, per_px = grid.intrinsics, 1.0 / grid.stride_px
         values = per_px * np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         kept = slice(-MAX_VIEWS + 1, None)
@@ -74,6 +80,9 @@ class SeenSpace:
         self.poses = np.concatenate([self.poses[kept], pose[None]])
         self.cameras = np.concatenate([self.cameras[kept], values[None]])
         self.stamps_ns = np.append(self.stamps_ns[kept], local.stamp_ns)
+        grey = np.full((*grid.depth_mm.shape, 3), GREY, np.uint8)
+        rgb = grey if grid.rgb is None else grid.rgb
+        self.colours = np.concatenate([self.colours[kept], rgb[None]])
 
     def look(self, points_world: Float64) -> tuple[Bool, Bool]:
         """Whether each point (n, 3) was seen as free, and as occupied; neither = not seen.
@@ -107,8 +116,9 @@ class SeenSpace:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Copies by name, for `restore`; empty without views."""
-        values = (self.depths_mm, self.poses, self.cameras, self.stamps_ns)
-        return {name: np.array(value) for name, value in zip(_NAMES, values)} if len(self) else {}
+        values = (self.depths_mm, self.poses, self.cameras, self.stamps_ns, self.colours)
+        named = zip((*_NAMES, _COLOURS), values)
+        return {name: np.array(value) for name, value in named} if len(self) else {}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Continue with the `arrays` of an earlier run; ValueError if they are none."""
@@ -120,10 +130,13 @@ class SeenSpace:
         poses = checked(arrays, _NAMES[1], np.float64, count, 4, 4)
         cameras = checked(arrays, _NAMES[2], np.float64, count, 4)
         stamps_ns = checked(arrays, _NAMES[3], np.int64, count)
+        colours = np.full((*depths_mm.shape, 3), GREY, np.uint8)
+        if _COLOURS in arrays:
+            colours = checked(arrays, _COLOURS, np.uint8, *depths_mm.shape, 3)
         within(_NAMES[1], poses, -1e8, 1e8)
         within(_NAMES[2], cameras, -1e6, 1e6)
         self.depths_mm, self.poses, self.cameras = depths_mm, poses, cameras
-        self.stamps_ns = stamps_ns
+        self.stamps_ns, self.colours = stamps_ns, colours
 
     def _has(self, pose: Float64) -> bool:
         """Whether a pose (4, 4) differs little from that of a view."""

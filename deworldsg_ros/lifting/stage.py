@@ -19,10 +19,12 @@ from deworldsg_ros.lifting.refine import (
     spatial_inliers,
     valid_depth,
 )
-from deworldsg_ros.scene.arrays import Float32, Float64, Int32, UInt16
+from deworldsg_ros.scene.arrays import Float32, Float64, Int32, UInt8, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
+    GRID,
+    GRID_STRIDE_PX,
     DepthGrid,
     FrameGraph,
     LocalGraph,
@@ -58,7 +60,6 @@ class LiftingConstants:
 
 # Every N-th pixel of the depth image is kept, in both directions, for the negative evidence of the
 # merging stage: 4800 samples of a 640 x 480 image.
-DEPTH_GRID_STRIDE_PX = 8
 # A surface gets one point for each 30 cm², up to LARGE_SURFACE_FACTOR times the usual number. Two
 # samples of a wardrobe then meet in the 3 cm cells of the merging stage, or in adjacent cells.
 POINT_AREA_M2 = 0.003
@@ -386,7 +387,7 @@ class Lifting:
             pixel_counts=np.array([item.pixel_count for item in found], np.int64),
             surface_points_world=_surface_points(found, T_world_camera),
             drops=drops,
-            depth_grid=_depth_grid(depth_m, instances, intrinsics),
+            depth_grid=_depth_grid(depth_m, instances, intrinsics, frame_graph.rgb_grid),
         )
 
     def lift_frame(
@@ -502,10 +503,11 @@ def _surface_points(objects: list[Estimate], T_world_camera: Float64) -> tuple[F
     return tuple([points[start:end] for start, end in zip([0, *ends], ends)])
 
 
-def _depth_grid(depth_m: Float32, instances: UInt16, intrinsics: Intrinsics) -> DepthGrid:
-    """Valid depth in whole millimetres, and instances, on every N-th pixel."""
-    every = slice(DEPTH_GRID_STRIDE_PX // 2, None, DEPTH_GRID_STRIDE_PX)
-    samples_mm = np.rint(depth_m[every, every] * 1000.0)
+def _depth_grid(
+    depth_m: Float32, instances: UInt16, intrinsics: Intrinsics, rgb: UInt8 | None
+) -> DepthGrid:
+    """Valid depth in whole millimetres, instances and colours, on every N-th pixel."""
+    samples_mm = np.rint(depth_m[GRID, GRID] * 1000.0)
     samples_mm = np.minimum(samples_mm, np.iinfo(np.uint16).max).astype(np.uint16)
-    samples = np.ascontiguousarray(instances[every, every], np.uint16)
-    return DepthGrid(samples_mm, DEPTH_GRID_STRIDE_PX, intrinsics, samples)
+    samples = np.ascontiguousarray(instances[GRID, GRID], np.uint16)
+    return DepthGrid(samples_mm, GRID_STRIDE_PX, intrinsics, samples, rgb)

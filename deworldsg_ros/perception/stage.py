@@ -42,7 +42,7 @@ from deworldsg_ros.scene.camera import (
     UprightFrame,
 )
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.frame_graph import Embeddings, FrameGraph, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import GRID, Embeddings, FrameGraph, Relations, Vocabulary
 from deworldsg_ros.scene.limits import check_names
 
 # --- The results of a frame that was turned upright, for the image as the camera took it: boxes and
@@ -482,6 +482,7 @@ class Perception:
         """
         found = self._perceive(seen.upright, detect)
         graph, instances = turned_back(found.frame_graph, found.instances, seen.turns)
+        graph = replace(graph, rgb_grid=np.ascontiguousarray(seen.original.rgb[GRID, GRID]))
         return replace(found, frame_graph=graph, instances=instances, turns=seen.turns)
 
     def _perceive(self, frame: RgbdFrame, detect: Callable[[], Detections]) -> Perceived:

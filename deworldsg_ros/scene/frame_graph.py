@@ -8,9 +8,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from deworldsg_ros.scene import checks, limits
-from deworldsg_ros.scene.arrays import Bool, Float16, Float32, Float64, Int64, UInt16
+from deworldsg_ros.scene.arrays import Bool, Float16, Float32, Float64, Int64, UInt8, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
+
+# Of the samples of an image that a frame carries along: every n-th pixel, from pixel n // 2 on.
+GRID_STRIDE_PX = 8
+GRID = slice(GRID_STRIDE_PX // 2, None, GRID_STRIDE_PX)
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,8 @@ class FrameGraph:
         colours_lab: (n, 3) float32, mean colour of each object, CIELAB; a row of NaN, or None = not
             known.
         embeddings: what the image shows of some of the objects; None = of none.
+        rgb_grid: (h, w, 3) uint8, samples of the image in both directions (`GRID`); None = not
+            available.
 
     The k-th object (from 0) has the value k + 1 in the frame's instance image, (H, W) uint16.
     """
@@ -120,9 +126,13 @@ class FrameGraph:
     relations: Relations
     colours_lab: Float32 | None = None
     embeddings: Embeddings | None = None
+    rgb_grid: UInt8 | None = None
 
     def __post_init__(self) -> None:
         count = len(self.boxes_xyxy)
+        if self.rgb_grid is not None:
+            height, width = len(range(self.height)[GRID]), len(range(self.width)[GRID])
+            checks.check_shape("colour grid", self.rgb_grid, (height, width, 3))
         if self.embeddings is not None:
             self.embeddings.check_rows(count)
         checks.check_boxes(self.boxes_xyxy, count)
@@ -147,12 +157,14 @@ class DepthGrid:
         intrinsics: of the whole image.
         instances: (h, w) uint16, value of the instance image on the same pixels; 0 = no object.
             None = not available.
+        rgb: (h, w, 3) uint8 on the same pixels; None = not available.
     """
 
     depth_mm: UInt16
     stride_px: int
     intrinsics: Intrinsics
     instances: UInt16 | None = None
+    rgb: UInt8 | None = None
 
     def __post_init__(self) -> None:
         if self.stride_px < 1:
@@ -166,6 +178,8 @@ class DepthGrid:
         checks.check_shape("depth grid", self.depth_mm, shape)
         if self.instances is not None:
             checks.check_shape("instances of the depth grid", self.instances, shape)
+        if self.rgb is not None:
+            checks.check_shape("colours of the depth grid", self.rgb, (*shape, 3))
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,11 @@ from functools import lru_cache
 import numpy as np
 from msgspec import UNSET, UnsetType
 
-from deworldsg_ros.scene.arrays import Float16, Float32, Float64, UInt16
+from deworldsg_ros.scene.arrays import Float16, Float32, Float64, UInt8, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
+    GRID,
     DepthGrid,
     Embeddings,
     FrameGraph,
@@ -146,6 +147,7 @@ def frame_graph_to_message(graph: FrameGraph) -> wire.FrameGraphMessage:
         ],
         relations=_relations_to_wire(graph.relations),
         embedding_model=UNSET if graph.embeddings is None else graph.embeddings.model,
+        rgb_grid=b"" if graph.rgb_grid is None else graph.rgb_grid.tobytes(),
     )
 
 
@@ -169,9 +171,14 @@ def frame_graph_from_message(message: wire.FrameGraphMessage) -> FrameGraph:
             relations=_relations_from_wire(message.relations, len(message.predicates)),
             colours_lab=_colours_from_wire(objects),
             embeddings=_embeddings_from_wire(objects, message.embedding_model),
+            rgb_grid=_rgb(message.rgb_grid, len(range(message.width)[GRID])),
         )
     except ValueError as error:
         raise RefusedInput("invalid_message", f"frame graph: {error}") from error
+
+
+def _rgb(content: bytes, columns: int) -> UInt8 | None:
+    return np.frombuffer(content, np.uint8).reshape(-1, columns, 3) if content else None
 
 
 def local_graph_to_message(graph: LocalGraph) -> wire.LocalGraphMessage:
@@ -270,6 +277,7 @@ def _depth_grid_to_wire(grid: DepthGrid | None) -> wire.DepthGridState | None:
         cy=camera.cy,
         depth_mm=grid.depth_mm.astype("<u2").tobytes(),
         instances=b"" if grid.instances is None else grid.instances.astype("<u2").tobytes(),
+        rgb=b"" if grid.rgb is None else grid.rgb.tobytes(),
     )
 
 
@@ -287,6 +295,7 @@ def _depth_grid_from_wire(message: wire.LocalGraphMessage) -> DepthGrid | None:
         state.stride_px,
         Intrinsics(state.fx, state.fy, state.cx, state.cy, message.width, message.height),
         pixels(state.instances) if state.instances else None,
+        _rgb(state.rgb, columns),
     )
 
 

@@ -128,6 +128,9 @@ Matrix3 = Annotated[
     msgspec.Meta(min_length=9, max_length=9, description="3x3, row by row"),
 ]
 # Part of a direction or quaternion of unit length, which may be rounded.
+RgbGrid = Annotated[
+    bytes, msgspec.Meta(description="R, G, B of every 8th pixel, from the 4th on; base64; or empty")
+]
 UnitPart = Annotated[float, msgspec.Meta(ge=-1.01, le=1.01)]
 Names = Annotated[list[Name], msgspec.Meta(min_length=1, max_length=MAX_NAMES)]
 # Row of an object in the message of its frame.
@@ -269,6 +272,7 @@ class FrameGraphMessage(Message, kw_only=True):
     objects: Annotated[list[DetectedObject], msgspec.Meta(max_length=MAX_OBJECTS)]
     relations: Annotated[list[RelationLogits], msgspec.Meta(max_length=MAX_RELATIONS)]
     embedding_model: Model = msgspec.UNSET
+    rgb_grid: RgbGrid = b""
 
 
 class LiftedObject(msgspec.Struct):
@@ -316,6 +320,7 @@ class DepthGridState(msgspec.Struct, frozen=True):
     instances: Annotated[
         bytes, msgspec.Meta(description="as depth_mm; 0 = no object; empty = not available")
     ] = b""
+    rgb: RgbGrid = b""
 
 
 class LocalGraphMessage(Message, kw_only=True):
@@ -692,8 +697,3 @@ def _check_unit(name: str, values: list[float]) -> None:
 def _check_once(name: str, items: list[Any]) -> None:
     if len(set(items)) < len(items):
         raise ValueError(f"{name} {Counter(items).most_common(1)[0][0]} is there twice")
-
-
-def json_schema(kind: type[Message]) -> dict[str, Any]:
-    """JSON Schema (2020-12) of a message."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | msgspec.json.schema(kind)

@@ -1,0 +1,152 @@
+"""The surface of the room: coloured points, made of the depth grids of different views.
+
+It is for people and planners, and no part of the paper's method: it changes nothing in the graph.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deworldsg_ros.graph.provenance import MIN_DEPTH_M, NEAR_FRACTION, NEAR_M, SeenSpace
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt8, UInt16
+from deworldsg_ros.scene.camera import invert_pose
+
+# A cell has one point. Of a larger room, cells are twice as wide, or four times.
+CELL_M = 0.02
+MOST_POINTS = 150_000
+# A depth that fewer than so many of four neighbours share is that of an edge between two surfaces.
+LEAST_ALIKE, ALIKE_M, ALIKE_FRACTION = 2, 0.03, 0.05
+# Views that see through a point outweigh those that saw it, of which so many count.
+MOST_VOTES = 4
+# Bits of a coordinate of a cell, and the cell at the origin.
+_BITS, _MIDDLE = 21, 1 << 20
+
+
+class Surface:
+    """Points of a room (n of them, some of which later views saw through).
+
+    Points are only added at the end: who has the first k of them needs the rest alone, and
+    `gone`. When cells become wider, all begins anew.
+
+    Attributes:
+        cell_m: width of a cell.
+        points: (n, 3) float32, world, metres.
+        colours: (n, 3) uint8 RGB.
+        gone: (n,) bool, seen through since.
+        begun: how often all began anew.
+    """
+
+    def __init__(self, most_points: int = MOST_POINTS) -> None:
+        self.cell_m = CELL_M
+        self.begun = 0
+        self._most_points = most_points
+        self._empty()
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def clear(self) -> None:
+        """Forget all points."""
+        self.begun += 1
+        self._empty()
+
+    def add(self, depth_mm: UInt16, rgb: UInt8, camera: Float64, T_world_camera: Float64) -> None:
+        """Add what a view shows, and take away what it sees through.
+
+        Args:
+            depth_mm: (h, w) uint16, 0 = invalid.
+            rgb: (h, w, 3) uint8.
+            camera: (4,) fx, fy, cx, cy in pixels of these images.
+            T_world_camera: (4, 4).
+        """
+        self._vote(depth_mm, camera, T_world_camera)
+        fx, fy, cx, cy = camera
+        rows, columns = np.nonzero(_is_smooth(depth_mm))
+        z = 0.001 * depth_mm[rows, columns]
+        # The centre of pixel c of the grid is at c + 1/2, as in `SeenSpace.look`.
+        x, y = (columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z
+        points = np.stack([x, y, z], axis=1) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+        self._extend(points.astype(np.float32), rgb[rows, columns])
+        while len(self.points) > self._most_points:
+            self._widen()
+
+    def kept(self) -> tuple[Float32, UInt8]:
+        """The points that no later view saw through, (m, 3), and their colours."""
+        return self.points[~self.gone], self.colours[~self.gone]
+
+    def _empty(self) -> None:
+        self.points: Float32 = np.zeros((0, 3), np.float32)
+        self.colours: UInt8 = np.zeros((0, 3), np.uint8)
+        self.gone: Bool = np.zeros(0, np.bool_)
+        self._votes: Int8 = np.zeros(0, np.int8)
+        self._cells: Int64 = np.zeros(0, np.int64)  # sorted, of the points that are not gone
+
+    def _extend(self, points: Float32, colours: UInt8) -> None:
+        cells = self._cells_of(points)
+        cells, first = np.unique(cells, return_index=True)
+        places = np.searchsorted(self._cells, cells)
+        known = np.zeros(len(cells), np.bool_)
+        inside = places < len(self._cells)
+        known[inside] = self._cells[places[inside]] == cells[inside]
+        new = first[~known]
+        self.points = np.concatenate([self.points, points[new]])
+        self.colours = np.concatenate([self.colours, colours[new]])
+        self.gone = np.concatenate([self.gone, np.zeros(len(new), np.bool_)])
+        self._votes = np.concatenate([self._votes, np.ones(len(new), np.int8)])
+        self._cells = np.insert(self._cells, places[~known], cells[~known])
+
+    def _vote(self, depth_mm: UInt16, camera: Float64, T_world_camera: Float64) -> None:
+        """Count for each point whether the view sees it, or through it."""
+        fx, fy, cx, cy = camera
+        T = invert_pose(T_world_camera).astype(np.float32)
+        x, y, z = (self.points @ T[:3, :3].T + T[:3, 3]).T
+        ahead = np.maximum(z, MIN_DEPTH_M)
+        columns, rows = np.floor(fx * x / ahead + cx), np.floor(fy * y / ahead + cy)
+        height, width = depth_mm.shape
+        seen = (z > MIN_DEPTH_M) & ~self.gone
+        seen &= (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+        at = np.flatnonzero(seen)
+        measured = 0.001 * depth_mm[rows[at].astype(int), columns[at].astype(int)]
+        behind, near = measured - z[at], NEAR_M + NEAR_FRACTION * z[at]
+        through = (measured > 0) & (behind > near)
+        votes = self._votes[at] - through + ((measured > 0) & (np.abs(behind) <= near))
+        self._votes[at] = np.minimum(votes, MOST_VOTES)
+        lost = at[votes <= 0]
+        if len(lost):
+            self.gone[lost] = True
+            self._cells = np.setdiff1d(self._cells, self._cells_of(self.points[lost]))
+
+    def _widen(self) -> None:
+        points, colours = self.kept()
+        self.cell_m *= 2
+        self.clear()
+        self._extend(points, colours)
+
+    def _cells_of(self, points: Float32) -> Int64:
+        """A number of the cell of each point; those of other rooms repeat."""
+        parts = np.floor(points / self.cell_m).astype(np.int64) + _MIDDLE
+        parts &= (1 << _BITS) - 1
+        return np.asarray((parts[:, 0] << 2 * _BITS) | (parts[:, 1] << _BITS) | parts[:, 2])
+
+
+def surface_of(space: SeenSpace | None, most_points: int = MOST_POINTS) -> Surface:
+    """The surface that the views of a graph show, the oldest first."""
+    surface = Surface(most_points)
+    if space is not None:
+        for view in zip(space.depths_mm, space.colours, space.cameras, space.poses):
+            surface.add(*view)
+    return surface
+
+
+def _is_smooth(depth_mm: UInt16) -> Bool:
+    """(h, w): the pixels with a depth that at least two of their neighbours share."""
+    depth = depth_mm.astype(np.float32)
+    limit = 1000 * ALIKE_M + ALIKE_FRACTION * depth
+    alike = np.zeros(depth.shape, np.int8)
+    for axis in (0, 1):
+        step = np.abs(np.diff(depth, axis=axis))
+        first = tuple(slice(None, -1) if i == axis else slice(None) for i in (0, 1))
+        last = tuple(slice(1, None) if i == axis else slice(None) for i in (0, 1))
+        alike[first] += step < limit[first]
+        alike[last] += step < limit[last]
+    return (depth_mm > 0) & (alike >= LEAST_ALIKE)
