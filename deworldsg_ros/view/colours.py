@@ -108,13 +108,14 @@ def class_colours(labels: Iterable[str]) -> dict[str, str]:
     labels in the order of node ids, a new label changes no colour.
     """
     colours: dict[str, str] = {}
+    taken: set[str] = set()
     for label in labels:
         if label in colours:
             continue
         start = zlib.crc32(label.encode())
         order = [PALETTE[(start + step) % len(PALETTE)] for step in range(len(PALETTE))]
-        taken = set(colours.values())
         colours[label] = next((colour for colour in order if colour not in taken), order[0])
+        taken.add(colours[label])
     return colours
 
 

@@ -140,7 +140,9 @@ def colours_of(
 
 def values_of(item: SceneObject, axes_of_view: Float64) -> dict[str, Any]:
     """What the page shows of an object."""
-    rotation = pose_from_quaternion(np.zeros(3), np.array(item.orientation_xyzw))[:3, :3]
+    quaternion = np.array(item.orientation_xyzw)  # of length one, but for its last digits
+    quaternion /= np.linalg.norm(quaternion)
+    rotation = pose_from_quaternion(np.zeros(3), quaternion)[:3, :3]
     deviations, axes = principal_axes(np.array(item.covariance_m2))
     words = in_words(item)
     return {

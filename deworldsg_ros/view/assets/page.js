@@ -255,6 +255,8 @@ function measure() {
   if (low.x > high.x) { low.set(-1, -1, 0); high.set(1, 1, 1); }
   const room = high.clone().sub(low);
   reach = Math.max(room.x, room.y, room.z, 0.5);
+  [camera.near, camera.far] = [Math.max(0.05, reach / 20000), Math.max(1000, 10 * reach)];
+  camera.updateProjectionMatrix();
   // Lines on the floor, a metre apart.
   const cells = Math.min(2 * Math.ceil(reach / 2) + 2, 200);
   if (floor?.cells !== cells) {
@@ -433,6 +435,19 @@ function showCard(id) {
 const SOURCES = { visual: "seen", prior: "judged by the world model",
   fused: "seen, and judged by the world model", operator: "said by an operator" };
 
+const reasons = new Map();  // of live relations: lines, and when they were asked for
+
+async function reasonsOf(edge) {
+  if (edge.why) return edge.why;
+  if (!isLive) return ["this page has no more of it; the command `deworldsg explain` has"];
+  const old = reasons.get(keyOf(edge));
+  if (old && performance.now() - old.at < 1000) return old.lines;
+  const asked = { at: performance.now(), lines: fetch(
+    `${location.pathname}/why/${edge.subject}/${edge.object}`).then(answer => answer.json()) };
+  reasons.set(keyOf(edge), asked);
+  return asked.lines;
+}
+
 function relationItem(edge, id) {
   const line = element("li"), more = element("details"), key = keyOf(edge);
   const other = edge.subject === id ? edge.object : edge.subject;
@@ -441,17 +456,17 @@ function relationItem(edge, id) {
   const ends = [edge.subject, edge.object].map(end => end === id ? name(end) : link);
   summary.append(ends[0], " ", element("b", "", head.verbs[edge.predicate]), " ", ends[1], " ",
     element("span", "quiet", `${percent(edge.probability)}, ${SOURCES[edge.provenance]}`));
-  more.open = opened.has(key);
   const show = async () => {
-    more.open ? opened.add(key) : opened.delete(key);
-    if (!more.open || more.childElementCount > 1) return;
-    const lines = edge.why ?? (isLive ? await (await fetch(
-      `${location.pathname}/why/${edge.subject}/${edge.object}`)).json()
-      : ["this page has no more of it; the command `deworldsg explain` has"]);
-    more.append(...lines.map(text => element("div", "hint", text)));
+    const lines = await reasonsOf(edge);
+    if (more.childElementCount === 1)
+      more.append(...lines.map(text => element("div", "hint", text)));
   };
-  more.ontoggle = show;
+  summary.onclick = () => {  // before it opens or closes
+    more.open ? opened.delete(key) : opened.add(key);
+    if (!more.open) show();
+  };
   more.append(summary);
+  more.open = opened.has(key);
   if (more.open) show();
   line.append(more);
   return line;
@@ -646,7 +661,9 @@ function apply(message) {
   for (const node of message.nodes ?? []) nodes.set(node.id, node);
   for (const edge of message.edges ?? []) edges.set(keyOf(edge), edge);
   for (const cloud of message.clouds ?? []) clouds.set(cloud.id, pointsOf(cloud));
-  for (const [id, stamp] of Object.entries(message.photos ?? {})) photos.set(Number(id), stamp);
+  for (const id of message.removedClouds ?? []) clouds.delete(id);
+  for (const id of message.removedPhotos ?? []) photos.delete(id);
+  for (const [id, stamp] of message.photos ?? []) photos.set(id, stamp);
   if (message.path) path = path.slice(0, message.from ?? 0).concat(message.path);
   if (message.camera) eye = message.camera;
   if (!nodes.has(chosen)) chosen = null;
@@ -654,10 +671,10 @@ function apply(message) {
   const count = [...edges.values()].filter(edge => !isDouble(edge)).length;
   byId("title").textContent = `${plural(nodes.size, "object")}, ${plural(count, "relation")}`;
   byId("subtitle").textContent = head.frame_id ? `world frame “${head.frame_id}”` : "";
-  if (message.head?.moments) showMoments(head.moments);
+  if (message.moments) showMoments(message.moments);
   if (message.head || message.nodes || message.removed || message.edges || message.removedEdges)
     draw("all");
-  if (message.clouds) draw("points");
+  if (message.clouds || message.removedClouds) draw("points");
   if (message.path || message.camera) draw("camera");
 }
 
@@ -674,7 +691,7 @@ let socket = null, moment = null;
 const tell = wish => { if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(wish)); };
 
 function connect() {
-  socket = new WebSocket(location.href.replace(/^http/, "ws"));
+  socket = new WebSocket(location.href.split("#")[0].replace(/^http/, "ws"));
   socket.binaryType = "blob";
   socket.onopen = () => {
     // The server begins anew: what it does not send is gone.

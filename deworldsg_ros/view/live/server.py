@@ -22,7 +22,7 @@ from websockets.http11 import Request, Response
 from deworldsg_ros.base.words import visible
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.view.live.camera import CameraView
-from deworldsg_ros.view.live.state import Guard, LiveState, LogOnce, OnError, PageView
+from deworldsg_ros.view.live.state import Guard, LiveState, LogOnce, OnError, PageView, scene_of
 from deworldsg_ros.view.page import html_of
 from deworldsg_ros.wire import messages as wire
 
@@ -34,6 +34,8 @@ WAITING_VIEWS = 2
 MOST_REQUEST_BYTES = 4096
 # More pages at once are refused: each has its own copy of what it was sent.
 MOST_PAGES = 32
+# A page that reads nothing for so long is closed.
+READ_LIMIT_S = 20.0
 # Only what is in the page runs, and it talks to its own server alone.
 HEADERS = {
     "Referrer-Policy": "no-referrer",  # it would tell the secret
@@ -81,14 +83,15 @@ class Viewer:
         self._loop = asyncio.new_event_loop()
         listens: Future[None] = Future()
         self._thread = threading.Thread(
-            target=lambda: self._loop.run_until_complete(self._run(host, port, listens)),
+            target=self._serve_forever,
+            args=(host, port, listens),
             name="viewer",
             daemon=True,
         )
         self._thread.start()
         try:
             listens.result()
-        except OSError as error:
+        except (OSError, ValueError) as error:  # UnicodeError of a host that is no name
             raise ConfigurationError(
                 f"cannot listen on host {host}, port {port}: {error}"
             ) from error
@@ -147,6 +150,13 @@ class Viewer:
         for waker in self._wakers:
             waker.set()
 
+    def _serve_forever(self, host: str, port: int, listens: Future[None]) -> None:
+        try:
+            self._loop.run_until_complete(self._run(host, port, listens))
+            self._loop.run_until_complete(self._loop.shutdown_default_executor())
+        finally:
+            self._loop.close()
+
     async def _run(self, host: str, port: int, listens: Future[None]) -> None:
         try:
             self._server = await serve(
@@ -157,13 +167,15 @@ class Viewer:
                 max_size=MOST_REQUEST_BYTES,
                 logger=_CONNECTIONS,
             )
-        except OSError as error:
+        except Exception as error:
             listens.set_exception(error)
             return
         listens.set_result(None)
         watching = asyncio.create_task(self._watch())
         async with self._server:
             await self._end.wait()
+            for connection in self._server.connections:
+                connection.transport.abort()
             self._server.close()
         watching.cancel()
 
@@ -180,14 +192,15 @@ class Viewer:
         path = self.guard.path(request.path, request.headers)
         if path is None:
             return connection.respond(403, "open the address that the program printed\n")
-        if "upgrade" in request.headers.get("Connection", "").lower():
+        if "upgrade" in ",".join(request.headers.get_all("Connection")).lower():
             return None if len(self._wakers) < MOST_PAGES else connection.respond(503, "too many\n")
-        zips = "gzip" in request.headers.get("Accept-Encoding", "")
+        zips = "gzip" in ",".join(request.headers.get_all("Accept-Encoding"))
+        path = path.partition("?")[0]
         if path == "/":
             body = self._packed if zips else self._page
             return _response("text/html; charset=utf-8", body, "gzip" if zips else "")
         with self._lock:
-            if match := PHOTO.fullmatch(path.partition("?")[0]):
+            if match := PHOTO.fullmatch(path):
                 photo = self._state.crops[int(match[1])]
                 if photo is not None:
                     return _response("image/jpeg", photo.image)
@@ -209,10 +222,12 @@ class Viewer:
                     await asyncio.wait_for(waker.wait(), 1.0)
                 waker.clear()
                 for message in await asyncio.to_thread(self._guarded, self._news, page) or ():
-                    await socket.send(message)
+                    await asyncio.wait_for(socket.send(message), READ_LIMIT_S)
                 await asyncio.sleep(PERIOD_S)
         except ConnectionClosed:
             pass
+        except asyncio.TimeoutError:
+            socket.transport.abort()
         finally:
             self._wakers.discard(waker)
             listening.cancel()
@@ -221,7 +236,7 @@ class Viewer:
         """Take what the user of a page chooses; what is no choice is left out."""
         with suppress(ConnectionClosed):
             async for text in socket:
-                with suppress(ValueError, AttributeError):
+                with suppress(ValueError, AttributeError, RecursionError):
                     chosen = json.loads(text)
                     moment = chosen.get("moment", page.moment)
                     if moment is None or (type(moment) is int and 0 <= moment < 2**53):
@@ -237,7 +252,14 @@ class Viewer:
         self._wake()
 
     def _news(self, page: PageView) -> list[str | bytes]:
+        moment = page.moment
         with self._lock:
+            recipe = self._state.recipe(page)
+        # The past is made without the lock: updates go on meanwhile.
+        scene = None if recipe is None else scene_of(*recipe)
+        with self._lock:
+            if scene is not None and moment is not None:
+                self._state.remember(moment, scene)
             return self._state.news(page, time.monotonic())
 
     def _guarded(self, step: Callable[..., Any], *arguments: Any) -> Any:

@@ -9,10 +9,10 @@ import math
 import secrets
 import socket
 import zlib
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 import msgspec
@@ -58,12 +58,27 @@ MOST_BYTES = 64_000_000
 BLOCK_PART = 16
 
 
+class Recipe(NamedTuple):
+    """How to make the graph of a moment: a snapshot, and the updates after it; JSON, packed."""
+
+    start: bytes
+    updates: tuple[bytes, ...]
+
+    def replica(self) -> GraphReplica:
+        """The graph."""
+        replica = GraphReplica()
+        replica.reset(wire.decode(zlib.decompress(self.start), wire.SceneGraphMessage))
+        for packed in self.updates:
+            replica.apply(wire.decode(zlib.decompress(packed), wire.SceneGraphUpdateMessage))
+        return replica
+
+
 class _Block:
     """A snapshot, the first moment of the block, and the updates after it; JSON, packed."""
 
     def __init__(self, start: wire.SceneGraphMessage) -> None:
         self._start, self._updates = _packed(start), list[bytes]()
-        self.size_bytes = len(self._start)
+        self.updates_bytes = 0
 
     def __len__(self) -> int:
         return 1 + len(self._updates)
@@ -72,15 +87,16 @@ class _Block:
         """Add the next moment."""
         packed = _packed(update)
         self._updates.append(packed)
-        self.size_bytes += len(packed)
+        self.updates_bytes += len(packed)
 
-    def at(self, moment: int) -> GraphReplica:
+    @property
+    def size_bytes(self) -> int:
+        """Of all."""
+        return len(self._start) + self.updates_bytes
+
+    def at(self, moment: int) -> Recipe:
         """The graph at a moment of the block."""
-        replica = GraphReplica()
-        replica.reset(wire.decode(zlib.decompress(self._start), wire.SceneGraphMessage))
-        for packed in self._updates[:moment]:
-            replica.apply(wire.decode(zlib.decompress(packed), wire.SceneGraphUpdateMessage))
-        return replica
+        return Recipe(self._start, tuple(self._updates[:moment]))
 
 
 def _packed(message: wire.Message) -> bytes:
@@ -145,17 +161,17 @@ class History:
             self._forget()
         return True
 
-    def at(self, moment: int) -> GraphReplica:
-        """The graph at a moment; the nearest one that is kept."""
+    def at(self, moment: int) -> Recipe | None:
+        """The graph at a moment, the nearest one that is kept; None = there is none."""
         left = min(max(moment, self.first), self.last) - self.first
         for block in self._blocks:
             if left < len(block):
                 return block.at(left)
             left -= len(block)
-        return GraphReplica()
+        return None
 
     def _is_full(self, block: _Block) -> bool:
-        return len(block) >= BLOCK or block.size_bytes * BLOCK_PART >= self._most_bytes
+        return len(block) >= BLOCK or block.updates_bytes * BLOCK_PART >= self._most_bytes
 
     def _begin(self, snapshot: wire.SceneGraphMessage) -> None:
         self._blocks.append(_Block(snapshot))
@@ -174,6 +190,8 @@ POINTS_OF_OBJECT = 256
 MOST_POINTS = 100_000
 # The camera's way has a place every so many metres; a long one loses every second place.
 STEP_M, MOST_PLACES = 0.03, 20_000
+# Graphs of earlier moments that are kept for the pages that show them.
+MOST_SCENES = 4
 # Surface points and images are large: they follow in these periods.
 CLOUDS_PERIOD_S, IMAGE_PERIOD_S = 1.0, 0.2
 
@@ -185,14 +203,48 @@ class Scene:
     Attributes:
         nodes, edges: each value by id, or by subject and object. Of an unchanged value, the same
             bytes.
-        head: what is true of all, but for the moments.
-        stamp_ns: of the graph.
+        labels, predicates: their names, those of the oldest objects first.
+        frame_id, stamp_ns: of the graph.
     """
 
     nodes: dict[int, bytes]
     edges: dict[Pair, bytes]
-    head: dict[str, Any]
+    labels: tuple[str, ...]
+    predicates: tuple[str, ...]
+    frame_id: str
     stamp_ns: int
+
+
+def scene_of(recipe: Recipe, up: Point) -> Scene:
+    """The graph of an earlier moment. It takes long: a tenth of a second and more."""
+    replica, axes = recipe.replica(), view_axes(up)
+    items = {
+        node_id: scene_object(node, replica.frame_id, up) for node_id, node in replica.nodes.items()
+    }
+    nodes = {node_id: text for node_id, item in items.items() if (text := _node_json(item, axes))}
+    edges = {
+        pair: _json(edge_values(edge))
+        for pair, edge in replica.edges.items()
+        if pair[0] in nodes and pair[1] in nodes
+    }
+    return Scene(
+        nodes,
+        edges,
+        tuple(dict.fromkeys(items[i].label for i in sorted(items))),
+        tuple(dict.fromkeys(edge.predicate for edge in replica.edges.values())),
+        replica.frame_id,
+        replica.stamp_ns,
+    )
+
+
+def _node_json(item: SceneObject, axes: Float64) -> bytes:
+    """The values of an object; empty, and a line in the log, if they cannot be computed."""
+    try:
+        return _json(values_of(item, axes))
+    except ValueError as error:
+        text = "live view: object %d is left out: %s"
+        logging.getLogger(__name__).error(text, item.id, error)
+        return b""
 
 
 @dataclass
@@ -209,8 +261,9 @@ class PageView:
     nodes: dict[int, bytes] = field(default_factory=dict)
     edges: dict[Pair, bytes] = field(default_factory=dict)
     clouds: dict[int, bytes] = field(default_factory=dict)
-    photos: dict[int, int] = field(default_factory=dict)
+    photos: dict[int, bytes] = field(default_factory=dict)
     head: bytes = b""
+    moments: bytes = b""
     places: tuple[int, int] = (0, 0)
     camera_ns: int | None = None
     image_ns: int | None = None
@@ -235,7 +288,9 @@ class LiveState:
         self._up: Point | None = None
         self._axes = view_axes(DEFAULT_UP)
         self._items: dict[int, SceneObject] = {}
-        self._nodes: dict[int, bytes] = {}
+        self._nodes: dict[int, bytes] = {}  # empty for what cannot be shown
+        self._scenes: OrderedDict[int, Scene] = OrderedDict()  # of the past
+        self._session: str | None = None
         self._edges: dict[Pair, tuple[wire.EdgeState, bytes]] = {}
         self._predicates: dict[str, int] = {}
         self._colours: dict[int, str] = {}
@@ -247,11 +302,13 @@ class LiveState:
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
         """Continue with a snapshot."""
         self.history.reset(snapshot)
+        self._begin_session()
 
     def apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
         """Apply the next update; as `History.apply`."""
         applied = self.history.apply(update)
         if applied:
+            self._begin_session()
             self.crops.merge(update.removed_nodes)
             for node in update.removed_nodes:
                 self._points.pop(node.id, None)
@@ -281,10 +338,24 @@ class LiveState:
                 known = self._points.get(node_id, np.zeros((0, 3), np.float32))
                 self._points[node_id] = np.concatenate([known, points])[-POINTS_OF_OBJECT:]
 
+    def recipe(self, page: PageView) -> tuple[Recipe, Point] | None:
+        """What `scene_of` needs for a page in the past; None if nothing is to be made."""
+        if page.moment is None or page.moment in self._scenes:
+            return None
+        found = self.history.at(page.moment)
+        return None if found is None else (found, self._up or DEFAULT_UP)
+
+    def remember(self, moment: int, scene: Scene) -> None:
+        """Keep the graph of an earlier moment for the next `news`."""
+        self._scenes[moment] = scene
+        while len(self._scenes) > MOST_SCENES:
+            self._scenes.popitem(last=False)
+
     def news(self, page: PageView, now_s: float) -> list[str | bytes]:
         """Messages that bring a page up to date; empty if it is.
 
-        A page that is slow asks seldom: what was between is left out.
+        A page that is slow asks seldom: what was between is left out. A page in the past gets what
+        `remember` was told, or the newest graph.
 
         Args:
             page: what the page has; it is updated.
@@ -292,8 +363,10 @@ class LiveState:
         """
         scene = self._newest()
         if page.moment is not None:
-            replica = self.history.at(page.moment)
-            scene = self._encoded(replica)
+            scene = self._scenes.get(page.moment, scene)
+        for node_id in page.nodes.keys() - scene.nodes.keys():  # the page forgets them, too
+            page.clouds.pop(node_id, None)
+            page.photos.pop(node_id, None)
         parts = [
             *_changes("nodes", "removed", page.nodes, scene.nodes, lambda node_id: node_id),
             *_changes("edges", "removedEdges", page.edges, scene.edges, list),
@@ -316,6 +389,7 @@ class LiveState:
         """The newest graph; only what changed is encoded again."""
         newest = self.history.newest
         if self._up != up_of(newest):  # every value is another
+            self._scenes.clear()
             self._up = up_of(newest)
             self._axes = view_axes(self._up)
             self._items, self._nodes, self._edges, self._clouds = {}, {}, {}, {}
@@ -330,7 +404,7 @@ class LiveState:
             if known is None or known.state is not node:
                 item = scene_object(node, newest.frame_id, self._up)
                 self._items[node_id] = item
-                self._nodes[node_id] = _json(values_of(item, self._axes))
+                self._nodes[node_id] = _node_json(item, self._axes)
                 changed = True
         for pair in self._edges.keys() - newest.edges.keys():
             del self._edges[pair]
@@ -340,56 +414,54 @@ class LiveState:
         if changed:
             colours = class_colours(self._items[i].label for i in sorted(self._items))
             self._colours = {i: colours[item.label] for i, item in self._items.items()}
-        edges = {
-            pair: text
-            for pair, (_, text) in self._edges.items()
-            if pair[0] in self._nodes and pair[1] in self._nodes
-        }
-        return Scene(self._nodes, edges, self._head(newest, self._items), newest.stamp_ns)
-
-    def _encoded(self, replica: GraphReplica) -> Scene:
-        """The graph of an earlier moment."""
-        items = {
-            node_id: scene_object(node, replica.frame_id, self._up or DEFAULT_UP)
-            for node_id, node in replica.nodes.items()
-        }
+        nodes = {node_id: text for node_id, text in self._nodes.items() if text}
         return Scene(
-            {node_id: _json(values_of(item, self._axes)) for node_id, item in items.items()},
+            nodes,
             {
-                pair: _json(edge_values(edge))
-                for pair, edge in replica.edges.items()
-                if pair[0] in items and pair[1] in items
+                pair: text
+                for pair, (_, text) in self._edges.items()
+                if pair[0] in nodes and pair[1] in nodes
             },
-            self._head(replica, items),
-            replica.stamp_ns,
+            tuple(dict.fromkeys(self._items[i].label for i in sorted(self._items))),
+            tuple(dict.fromkeys(edge.predicate for edge in newest.edges.values())),
+            newest.frame_id,
+            newest.stamp_ns,
         )
 
-    def _head(self, replica: GraphReplica, items: Mapping[int, SceneObject]) -> dict[str, Any]:
-        # A predicate keeps its colour: the first one that came is the first of the palette.
-        for edge in replica.edges.values():
-            self._predicates.setdefault(edge.predicate, -len(self._predicates))
-        return {
-            "colours": class_colours(items[i].label for i in sorted(items)),
-            "tints": predicate_colours(self._predicates),
-            "verbs": {predicate: verb_of(predicate) for predicate in self._predicates},
-            "frame_id": replica.frame_id,
-            "hidden": {},
-            "why": self.why_empty,
-        }
+    def _begin_session(self) -> None:
+        """Ids of another session are of other objects."""
+        if self.history.session != self._session:
+            self._session = self.history.session
+            self.crops, self._points, self._places = BestViews(), {}, []
+            self._redrawn += 1
 
     def _head_news(self, page: PageView, scene: Scene) -> list[str]:
-        newest_ns = self.history.newest.stamp_ns
-        moments = {
-            "first": self.history.first,
-            "last": self.history.last,
-            "shown": page.moment,
-            "late_s": round((newest_ns - scene.stamp_ns) / 1e9, 1),
-        }
-        head = _json({**scene.head, "moments": moments})
-        if head == page.head:
-            return []
-        page.head = head
-        return [f'"head":{head.decode()}']
+        # A predicate keeps its colour: the first one that came is the first of the palette.
+        for predicate in scene.predicates:
+            self._predicates.setdefault(predicate, -len(self._predicates))
+        head = _json(
+            {
+                "colours": class_colours(scene.labels),
+                "tints": predicate_colours(self._predicates),
+                "verbs": {predicate: verb_of(predicate) for predicate in self._predicates},
+                "frame_id": scene.frame_id,
+                "hidden": {},
+                "why": self.why_empty,
+            }
+        )
+        moments = _json(
+            {
+                "first": self.history.first,
+                "last": self.history.last,
+                "shown": page.moment,
+                "late_s": round((self.history.newest.stamp_ns - scene.stamp_ns) / 1e9, 1),
+            }
+        )
+        parts = [f'"head":{head.decode()}'] if head != page.head else []
+        if moments != page.moments:
+            parts.append(f'"moments":{moments.decode()}')
+        page.head, page.moments = head, moments
+        return parts
 
     def _cloud_news(self, page: PageView, scene: Scene, now_s: float) -> list[str]:
         if now_s - page.clouds_s < CLOUDS_PERIOD_S:
@@ -397,14 +469,12 @@ class LiveState:
         page.clouds_s = now_s
         clouds = self._encoded_clouds()
         shown = {node_id: clouds[node_id] for node_id in scene.nodes if node_id in clouds}
-        news = [text for node_id, text in shown.items() if page.clouds.get(node_id) is not text]
-        page.clouds = shown
         stamps = self.crops.stamps()
-        photos = {node_id: stamps[node_id] for node_id in scene.nodes if node_id in stamps}
-        new = {str(i): stamp for i, stamp in photos.items() if page.photos.get(i) != stamp}
-        page.photos = photos
-        parts = [f'"clouds":{_list(news)}'] if news else []
-        return [*parts, f'"photos":{_json(new).decode()}'] if new else parts
+        photos = {i: _json([i, stamps[i]]) for i in scene.nodes if i in stamps}
+        return [
+            *_changes("clouds", "removedClouds", page.clouds, shown, lambda node_id: node_id),
+            *_changes("photos", "removedPhotos", page.photos, photos, lambda node_id: node_id),
+        ]
 
     def _encoded_clouds(self) -> dict[int, bytes]:
         """Surface points of the newest objects; only what changed is encoded again."""

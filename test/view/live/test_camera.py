@@ -102,7 +102,7 @@ def test_points_of_the_frames_stand_in_for_those_of_the_graph():
     assert "clouds" not in json.loads(state.news(page, 0.0)[0])  # of no node of the graph
     state.reset(make_graph([make_node(7, "cup")]))
     message = json.loads(state.news(page, 2.0)[0])
-    assert [cloud["id"] for cloud in message["clouds"]] == [7] and message["photos"] == {"7": 1}
+    assert [cloud["id"] for cloud in message["clouds"]] == [7] and message["photos"] == [[7, 1]]
 
 
 def send(joiner, stamp_ns, parts=camera.PARTS, now_s=0.0, decoded=None):

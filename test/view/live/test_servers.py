@@ -2,6 +2,7 @@
 
 import contextlib
 import gzip
+import itertools
 import json
 import socket
 import threading
@@ -9,6 +10,7 @@ import time
 import urllib.error
 import urllib.request
 from contextlib import closing
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -22,7 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.view.live import server, sources
+from deworldsg_ros.view.live import server, sources, state
 from deworldsg_ros.view.live.camera import CameraView
 from deworldsg_ros.view.live.server import Viewer
 from deworldsg_ros.view.live.state import Guard
@@ -70,7 +72,7 @@ def test_pages_get_the_graph_and_choose_for_themselves():
             for moment in ('"x"', "-1", "true", "1e99", "[]", "9" * 5000):
                 with contextlib.suppress(ConnectionClosed):
                     one.send(f'{{"moment": {moment}}}'[:4000])
-            for text in ("", "{", "[]", "3", b"\0"):
+            for text in ("", "{", "[]", "3", b"\0", "[" * 2000):
                 one.send(text)
             one.send(json.dumps({"moment": None}))
             one_has(4)
@@ -127,6 +129,36 @@ def test_frames_are_taken_without_a_page_and_late_pages_see_the_way():
             assert page.recv(LIMIT_S).startswith(b"\xff\xd8")
 
 
+def test_opening_and_closing_leaves_nothing(caplog):
+    def held():
+        return len(list(Path("/proc/self/fd").iterdir())), threading.active_count()
+
+    for number in range(8):
+        if number == 2:
+            before = held()
+        with closing(Viewer(HERE, free_port(), "")) as viewer, shown(viewer):
+            viewer.reset(cups(1))
+    assert held()[0] <= before[0] + 2 and held()[1] <= before[1] + 1
+
+
+def test_a_page_that_reads_nothing_is_closed_and_its_place_is_free(monkeypatch):
+    monkeypatch.setattr(server, "READ_LIMIT_S", 0.5)
+    monkeypatch.setattr(state, "IMAGE_PERIOD_S", 0.0)
+    rng, count = np.random.default_rng(0), itertools.count(1)
+    with closing(Viewer(HERE, free_port(), "")) as viewer:
+        url = urlsplit(viewer.url)
+        with socket.create_connection((HERE, url.port), LIMIT_S) as lazy:
+            lazy.sendall(handshake(url.port, url.path))
+            wait_until(lambda: viewer._wakers, LIMIT_S, "the page")
+
+            def is_closed():
+                noise = rng.integers(0, 255, (480, 640, 3)).astype(np.uint8)
+                viewer.look(CameraView(next(count), np.eye(4), noise))
+                return not viewer._wakers
+
+            wait_until(is_closed, 2 * LIMIT_S, "the end of the page", lambda: time.sleep(0.1))
+
+
 def test_the_page_a_photo_and_an_explanation_over_http():
     with closing(Viewer(HERE, free_port(), "")) as viewer:
         nodes = [make_node(1, "cup"), make_node(2, "table")]
@@ -149,6 +181,7 @@ def test_the_page_a_photo_and_an_explanation_over_http():
         lines = json.loads(get("/why/1/2")[0])
         assert any("80%" in line for line in lines)
         assert json.loads(get("/why/2/1")[0]) == []
+        assert get("/?x=1")[0] == page
         for path in ("/photo/1", "/photo/x", "/why/1", "/etc/passwd", "/../page.js"):
             with pytest.raises(urllib.error.HTTPError, match="404"):
                 get(path)
@@ -184,7 +217,7 @@ def test_a_server_listens_on_the_chosen_port_or_the_next_free_one(
         sources.open_sink(HERE, taken, "", foxglove=foxglove)
 
 
-@pytest.mark.parametrize("host", ["192.0.2.1", "not an address"])
+@pytest.mark.parametrize("host", ["192.0.2.1", "not an address", "a" * 70])
 def test_an_address_of_another_machine_is_refused(host):
     with pytest.raises(ConfigurationError, match=host):
         sources.open_sink(host, 0, "", foxglove=False)

@@ -5,12 +5,20 @@ import json
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from support.view import box_at, make_edge, make_graph, make_node, random_graphs, updates_of
 
 from deworldsg_ros.client.objects import scene_object
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.view.live.camera import CameraView
-from deworldsg_ros.view.live.state import BLOCK, CLOUDS_PERIOD_S, History, LiveState, PageView
+from deworldsg_ros.view.live.camera import CameraView, Crop
+from deworldsg_ros.view.live.state import (
+    BLOCK,
+    CLOUDS_PERIOD_S,
+    History,
+    LiveState,
+    PageView,
+    scene_of,
+)
 from deworldsg_ros.view.page import in_words
 from deworldsg_ros.wire import messages as wire
 
@@ -28,11 +36,14 @@ class Page:
     def __init__(self, state):
         self.state, self.view, self.now_s = state, PageView(), 0.0
         self.nodes, self.edges, self.clouds, self.head, self.path = {}, {}, {}, {}, []
-        self.camera, self.photos, self.images = None, {}, []
+        self.camera, self.photos, self.images, self.moments = None, {}, [], {}
 
     def look(self, after_s=CLOUDS_PERIOD_S):
         """Take the news; the keys that changed."""
         self.now_s += after_s
+        recipe = self.state.recipe(self.view)
+        if recipe is not None:
+            self.state.remember(self.view.moment, scene_of(*recipe))
         messages = self.state.news(self.view, self.now_s)
         self.images += [item for item in messages if isinstance(item, bytes)]
         texts = [json.loads(item) for item in messages if isinstance(item, str)]
@@ -41,12 +52,18 @@ class Page:
         for node_id in message.get("removed", ()):
             del self.nodes[node_id]
             self.clouds.pop(node_id, None)
+            self.photos.pop(node_id, None)
         for pair in message.get("removedEdges", ()):
             del self.edges[tuple(pair)]
         self.nodes |= {item["id"]: item for item in message.get("nodes", ())}
         self.edges |= {(e["subject"], e["object"]): e for e in message.get("edges", ())}
         self.clouds |= {item["id"]: item for item in message.get("clouds", ())}
-        self.photos |= message.get("photos", {})
+        for node_id in message.get("removedClouds", ()):
+            del self.clouds[node_id]
+        for node_id in message.get("removedPhotos", ()):
+            del self.photos[node_id]
+        self.photos |= dict(message.get("photos", ()))
+        self.moments = message.get("moments", self.moments)
         self.head = message.get("head", self.head)
         self.camera = message.get("camera", self.camera)
         if "path" in message:
@@ -101,7 +118,7 @@ def test_only_what_changed_is_sent():
     assert state.apply(*updates_of([before, make_graph(moved, sequence=2)]))
     message = json.loads(state.news(page.view, page.now_s)[0])
     assert [item["id"] for item in message["nodes"]] == [100]
-    assert set(message) == {"head", "nodes"}  # another number of moments, another colour
+    assert set(message) == {"head", "moments", "nodes"}  # another colour
 
 
 def test_each_page_goes_back_in_time_on_its_own():
@@ -115,8 +132,8 @@ def test_each_page_goes_back_in_time_on_its_own():
     then.look(), now.look()
     shows(then, graphs[10])
     shows(now, graphs[-1])
-    assert then.head["moments"]["shown"] == 9 and now.head["moments"]["shown"] is None
-    assert then.head["moments"]["last"] == 29
+    assert then.moments["shown"] == 9 and now.moments["shown"] is None
+    assert then.moments["last"] == 29
     then.view.moment = None
     then.look()
     shows(then, graphs[-1])
@@ -174,6 +191,52 @@ def test_a_long_way_is_made_shorter_and_a_page_gets_it_anew(monkeypatch):
         assert page.path == sorted(page.path)
 
 
+def test_what_was_hidden_by_a_look_back_comes_again():
+    state = LiveState()
+    points = [(0, 0, 0)]
+    first, second = node(1, points=points), node(2, center=(1, 0, 0), points=points)
+    graphs = [make_graph([first]), make_graph([first, second], sequence=2)]
+    state.reset(graphs[0])
+    page = Page(state)
+    state.apply(*updates_of(graphs))
+    page.look()
+    assert set(page.clouds) == {1, 2}
+    for moment in (0, None):
+        page.view.moment = moment
+        page.look(after_s=0.1)
+    page.look()
+    assert set(page.clouds) == set(page.nodes) == {1, 2}
+
+
+def test_another_session_has_other_objects_under_the_same_ids():
+    state = LiveState()
+    state.reset(make_graph([node(1)], session="a"))
+    state.crops._put(1, Crop(1.0, 5, b"jpeg"))
+    state._points[1] = np.ones((3, 3), np.float32)
+    page = Page(state)
+    page.look()
+    assert page.photos == {1: 5} and set(page.clouds) == {1}
+    state.reset(make_graph([node(1, "sofa")], session="b"))
+    page.look()
+    assert page.photos == {} and page.clouds == {} and page.nodes[1]["label"] == "sofa"
+
+
+def test_an_object_that_cannot_be_shown_is_left_out_and_the_others_are_not(caplog):
+    state = LiveState()
+    odd = node(2)
+    odd = replace(odd, box=replace(odd.box, size_m=[float("nan")] * 3))
+    turned = node(3)
+    turned = replace(turned, box=replace(turned.box, orientation_xyzw=[0, 0, 0, 0.98995]))
+    state.reset(make_graph([node(1), odd, turned]))
+    page = Page(state)
+    page.look()
+    page.look()
+    assert {1, 3} <= set(page.nodes)
+    state.reset(make_graph([node(1)], sequence=2))
+    page.look()
+    assert set(page.nodes) == {1}
+
+
 def test_a_relation_is_explained():
     state = LiveState()
     state.reset(make_graph([node(1), node(2, "table")], [make_edge(1, 2)]))
@@ -207,21 +270,21 @@ def test_each_moment_is_the_graph_of_its_update_and_the_oldest_are_forgotten(cou
     assert (history.first == 0) == (count <= BLOCK)
     assert history.last - history.first >= BLOCK or history.first == 0
     for moment in {history.first, (history.first + count) // 2, count - 1}:
-        assert history.at(moment).message() == graphs[moment + 1]
-    assert history.at(0).message() == graphs[history.first + 1]
+        assert history.at(moment).replica().message() == graphs[moment + 1]
+    assert history.at(0).replica().message() == graphs[history.first + 1]
     assert history.newest.message() == graphs[-1]
 
 
 def test_a_gap_in_the_history_is_refused_and_a_snapshot_closes_it():
     history = History()
-    assert history.last == -1 and not history.at(0).nodes
+    assert history.last == -1 and history.at(0) is None
     graphs = random_graphs(0, 3, ["cup"], [0.0])
     first, _, third = updates_of(graphs)
     history.apply(first)
     with pytest.raises(RefusedInput, match="lost_updates|reset"):
         history.apply(third)
     history.reset(graphs[3])
-    assert [history.at(moment).sequence for moment in (0, 1)] == [1, 3]
+    assert [history.at(moment).replica().sequence for moment in (0, 1)] == [1, 3]
 
 
 # --- details of an object ----------------------------------------------------------------------
