@@ -41,7 +41,8 @@ from deworldsg_ros.cli.terminal import (
 )
 from deworldsg_ros.config import Config
 from deworldsg_ros.doctor import Finding, find
-from deworldsg_ros.graph.graph_files import GRAPH_FILE, read_graph
+from deworldsg_ros.graph.graph_files import GRAPH_FILE, graph_path, read_graph
+from deworldsg_ros.graph.provenance import read_space
 from deworldsg_ros.recordings import replaying
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
@@ -498,7 +499,8 @@ def run_demo(
             graph = read_graph(staged)
             poses = [np.array(values).reshape(4, 4) for values in finished.poses]
             frames = _frames(recording.path, config, options)
-            outputs.show_graph(staged, graph, console, poses, config.inputs.world_up, frames)
+            space = read_space(graph_path(staged))
+            outputs.show_graph(staged, graph, console, poses, config.inputs.world_up, frames, space)
             findings = _findings(graph, finished, config)
             _write_report(staged, recording, graph, finished, wall_s, findings)
         if progress.stopped:

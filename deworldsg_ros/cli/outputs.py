@@ -21,7 +21,7 @@ from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.doctor import Finding, FrameSampler, Observations, find
 from deworldsg_ros.graph.embeddings import embeddings_path
 from deworldsg_ros.graph.graph_files import GRAPH_FILE
-from deworldsg_ros.graph.provenance import path_beside, space_path
+from deworldsg_ros.graph.provenance import SeenSpace, path_beside, space_path
 from deworldsg_ros.recordings.bags.bag import BagSource
 from deworldsg_ros.recordings.posing import PosedSource
 from deworldsg_ros.recordings.recording import Recording
@@ -94,6 +94,7 @@ def show_graph(
     T_world_cameras: Sequence[Float64],
     world_up: str,
     frames: Iterable[RgbdFrame] = (),
+    space: SeenSpace | None = None,
 ) -> None:
     """Print the tables, draw the picture and write the page.
 
@@ -104,6 +105,7 @@ def show_graph(
         T_world_cameras: poses (4, 4) of the processed frames.
         world_up: `inputs.world_up`.
         frames: some frames of the recording, for photos of the objects.
+        space: what the camera saw of the room; None = the page has no surface of it.
     """
     # Imported here because matplotlib takes a second to load.
     from deworldsg_ros.view import page, photos, picture, table
@@ -121,7 +123,13 @@ def show_graph(
             camera_path_world=path_world,
             photos=photos.photos_of(graph, frames, PHOTO_PX),
         )
-        page.write(graph, out / PAGE_FILE, up_world=up.up_world(), camera_path_world=path_world)
+        page.write(
+            graph,
+            out / PAGE_FILE,
+            up_world=up.up_world(),
+            camera_path_world=path_world,
+            space=space,
+        )
 
 
 def write_report(out: Path, report: Mapping[str, Any]) -> None:

@@ -318,7 +318,8 @@ def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
             write_embeddings(path, wire.ns_from_stamp(graph.stamp), embeddings)
         world_up = pipeline.config.inputs.world_up
         frames = processed.album.frames
-        outputs.show_graph(staged, graph, console, T_world_cameras, world_up, frames)
+        space = None if pipeline.builder is None else pipeline.builder.space
+        outputs.show_graph(staged, graph, console, T_world_cameras, world_up, frames, space)
         outputs.write_report(staged, _report(ran, graph))
         # Last: each of these two is in place at once, and must not be if the results failed.
         if options.trajectory_out is not None:

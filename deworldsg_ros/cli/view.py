@@ -18,7 +18,8 @@ from rich.console import Console
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.outputs import print_drops
 from deworldsg_ros.cli.terminal import frame_progress, node_command
-from deworldsg_ros.graph.graph_files import read_graph
+from deworldsg_ros.graph.graph_files import graph_path, read_graph
+from deworldsg_ros.graph.provenance import read_space
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.posing import PoseChoice, choose_poses, posed_frames
@@ -74,6 +75,7 @@ def view_graph(options: ViewOptions, console: Console) -> None:
     if options.path is None:
         _become_viewer_node(options)
         return
+    from deworldsg_ros.view.live.server import Viewer
     from deworldsg_ros.view.live.sources import is_graph, open_sink
 
     graph = read_graph(options.path) if is_graph(options.path) else None
@@ -83,6 +85,9 @@ def view_graph(options: ViewOptions, console: Console) -> None:
         console.print(f"view: {viewer.url}", highlight=False, soft_wrap=True)
         if graph is not None:
             viewer.reset(graph)
+            space = read_space(graph_path(options.path))
+            if isinstance(viewer, Viewer) and space is not None:
+                viewer.see(space)
         else:
             _show_recording(viewer, options, console)
         console.print("press Ctrl-C to end", highlight=False)

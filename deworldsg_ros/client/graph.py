@@ -48,7 +48,7 @@ from deworldsg_ros.client.objects import (
 from deworldsg_ros.client.text_tower import embed_text
 from deworldsg_ros.graph.embeddings import Looks, embeddings_path, read_embeddings
 from deworldsg_ros.graph.extent import DEFAULT_UP
-from deworldsg_ros.graph.graph_files import GRAPH_FILE, read_graph
+from deworldsg_ros.graph.graph_files import graph_path, read_graph
 from deworldsg_ros.graph.provenance import SeenFrames, SeenSpace, read_seen, read_space
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ClientError
@@ -287,7 +287,7 @@ class SceneGraph:
             RefusedInput: if the file is missing or contains no scene graph, or its embeddings
                 are damaged.
         """
-        file = Path(path) / GRAPH_FILE if Path(path).is_dir() else Path(path)
+        file = graph_path(Path(path))
         message = read_graph(file)
         graph = cls(message, read_seen(file, wire.ns_from_stamp(message.stamp)))
         graph.space = read_space(file)

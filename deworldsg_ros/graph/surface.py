@@ -11,8 +11,8 @@ from deworldsg_ros.graph.provenance import MIN_DEPTH_M, NEAR_FRACTION, NEAR_M, S
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt8, UInt16
 from deworldsg_ros.scene.camera import invert_pose
 
-# A cell has one point. Of a larger room, cells are twice as wide, or four times.
-CELL_M = 0.02
+# A cell has one point. Those of larger rooms are wider, by this factor once or more.
+CELL_M, WIDER = 0.02, 1.3
 MOST_POINTS = 150_000
 # A depth that fewer than so many of four neighbours share is that of an edge between two surfaces.
 LEAST_ALIKE, ALIKE_M, ALIKE_FRACTION = 2, 0.03, 0.05
@@ -32,6 +32,8 @@ class Surface:
         cell_m: width of a cell.
         points: (n, 3) float32, world, metres.
         colours: (n, 3) uint8 RGB.
+        sides: (n, 3) int8, from the point to the camera that saw it, of length 127: the side of the
+            surface that is known.
         gone: (n,) bool, seen through since.
         begun: how often all began anew.
     """
@@ -65,23 +67,27 @@ class Surface:
         z = 0.001 * depth_mm[rows, columns]
         # The centre of pixel c of the grid is at c + 1/2, as in `SeenSpace.look`.
         x, y = (columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z
-        points = np.stack([x, y, z], axis=1) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        self._extend(points.astype(np.float32), rgb[rows, columns])
+        rays = np.stack([x, y, z], axis=1) @ T_world_camera[:3, :3].T
+        sides = -127 * rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        points = (rays + T_world_camera[:3, 3]).astype(np.float32)
+        self._extend(points, rgb[rows, columns], np.round(sides).astype(np.int8))
         while len(self.points) > self._most_points:
             self._widen()
 
-    def kept(self) -> tuple[Float32, UInt8]:
-        """The points that no later view saw through, (m, 3), and their colours."""
-        return self.points[~self.gone], self.colours[~self.gone]
+    def kept(self) -> tuple[Float32, UInt8, Int8]:
+        """The points that no later view saw through, (m, 3), with their colours and sides."""
+        kept = ~self.gone
+        return self.points[kept], self.colours[kept], self.sides[kept]
 
     def _empty(self) -> None:
         self.points: Float32 = np.zeros((0, 3), np.float32)
         self.colours: UInt8 = np.zeros((0, 3), np.uint8)
+        self.sides: Int8 = np.zeros((0, 3), np.int8)
         self.gone: Bool = np.zeros(0, np.bool_)
         self._votes: Int8 = np.zeros(0, np.int8)
         self._cells: Int64 = np.zeros(0, np.int64)  # sorted, of the points that are not gone
 
-    def _extend(self, points: Float32, colours: UInt8) -> None:
+    def _extend(self, points: Float32, colours: UInt8, sides: Int8) -> None:
         cells = self._cells_of(points)
         cells, first = np.unique(cells, return_index=True)
         places = np.searchsorted(self._cells, cells)
@@ -91,6 +97,7 @@ class Surface:
         new = first[~known]
         self.points = np.concatenate([self.points, points[new]])
         self.colours = np.concatenate([self.colours, colours[new]])
+        self.sides = np.concatenate([self.sides, sides[new]])
         self.gone = np.concatenate([self.gone, np.zeros(len(new), np.bool_)])
         self._votes = np.concatenate([self._votes, np.ones(len(new), np.int8)])
         self._cells = np.insert(self._cells, places[~known], cells[~known])
@@ -117,10 +124,10 @@ class Surface:
             self._cells = np.setdiff1d(self._cells, self._cells_of(self.points[lost]))
 
     def _widen(self) -> None:
-        points, colours = self.kept()
-        self.cell_m *= 2
+        kept = self.kept()
+        self.cell_m *= WIDER
         self.clear()
-        self._extend(points, colours)
+        self._extend(*kept)
 
     def _cells_of(self, points: Float32) -> Int64:
         """A number of the cell of each point; those of other rooms repeat."""

@@ -20,7 +20,9 @@ from deworldsg_ros.base.files import write_atomically
 from deworldsg_ros.client.explain import explain_relation
 from deworldsg_ros.client.objects import SceneObject, relation_of, scene_object
 from deworldsg_ros.graph.extent import surface_points
-from deworldsg_ros.scene.arrays import Float32, Float64
+from deworldsg_ros.graph.provenance import SeenSpace
+from deworldsg_ros.graph.surface import Surface, surface_of
+from deworldsg_ros.scene.arrays import Float32, Float64, Int8, UInt8
 from deworldsg_ros.scene.camera import pose_from_quaternion
 from deworldsg_ros.scene.vocabulary import verb_of
 from deworldsg_ros.view.colours import (
@@ -38,6 +40,10 @@ ASSETS = Path(__file__).with_name("assets")
 # More add megabytes, not detail.
 MOST_POINTS = 20_000
 MOST_PATH_POINTS = 1_000
+# Of the room's surface, in a kept page: 16 bytes each.
+MOST_SURFACE_POINTS = 50_000
+# Of surface points, metres: int16 reaches 65 m from the first one.
+SURFACE_STEP_M = 0.002
 # Relations whose reasons a kept page has, the most probable ones.
 MOST_REASONS = 400
 # A second class is worth a word from this share of the first one's probability on, and as likely
@@ -51,6 +57,7 @@ def write(
     *,
     up_world: Sequence[float] | Float64 = (0.0, 0.0, 1.0),
     camera_path_world: Float64 | None = None,
+    space: SeenSpace | None = None,
 ) -> None:
     """Write the page.
 
@@ -59,12 +66,17 @@ def write(
         path: HTML file to write.
         up_world: (3,) direction that points up in the world frame.
         camera_path_world: (n, 3) positions of the camera, metres; None = not drawn.
+        space: what the camera saw of the room, for its surface; None = not drawn.
 
     Raises:
         ValueError: for an up direction of zero length.
         OSError: if the page cannot be written.
     """
-    content = content_of(graph, view_axes(up_world), camera_path_world)
+    axes_of_view = view_axes(up_world)
+    content = content_of(graph, axes_of_view, camera_path_world)
+    surface = surface_of(space, MOST_SURFACE_POINTS)
+    if len(surface):
+        content["surface"] = surface_values(surface, surface.kept(), axes_of_view)
     write_atomically(Path(path), html_of(f"Scene graph of {len(graph.nodes)} objects", content))
 
 
@@ -196,6 +208,27 @@ def cloud_values(
         "id": item.id,
         "from": _rounded(axes_of_view @ item.position_m, 4),
         "mm": base64.b64encode(np.round(steps).astype("<i2").tobytes()).decode(),
+    }
+
+
+def surface_values(
+    surface: Surface, points: tuple[Float32, UInt8, Int8], axes_of_view: Float64
+) -> dict[str, Any]:
+    """Some points of the room's surface, with their colours and sides; base64.
+
+    Positions are steps from the first point of the surface.
+    """
+    positions, colours, sides = points
+    origin = surface.points[0]
+    steps = np.clip((positions - origin) @ axes_of_view.T / SURFACE_STEP_M, -32767, 32767)
+    turned = np.clip(sides @ axes_of_view.T, -127, 127)
+    return {
+        "origin": _rounded(axes_of_view @ origin, 4),
+        "step": SURFACE_STEP_M,
+        "cell": round(surface.cell_m, 4),
+        "steps": base64.b64encode(np.round(steps).astype("<i2").tobytes()).decode(),
+        "rgb": base64.b64encode(colours.tobytes()).decode(),
+        "sides": base64.b64encode(np.round(turned).astype(np.int8).tobytes()).decode(),
     }
 
 

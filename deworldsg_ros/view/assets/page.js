@@ -80,6 +80,69 @@ for (const layer of Object.values(layers)) {
   scene.add(layer);
 }
 
+// The room: points of the surfaces that the camera saw, in their colours.
+const room = { places: new Float32Array(0), colours: new Float32Array(0), sides: new Int8Array(0),
+  cell: 0.02 };
+let hasChosenPoints = false;  // else those of the room take the place of those of the objects
+layers.room = new THREE.Points(empty(), new THREE.PointsMaterial(
+  { vertexColors: true, transparent: true, size: 0.03 }));
+// A wall is seen from its own side: from outside one looks into the room.
+layers.room.material.onBeforeCompile = shader => {
+  shader.vertexShader = shader.vertexShader
+    .replace("void main() {", "attribute vec3 side;\nvoid main() {")
+    .replace("#include <project_vertex>", `#include <project_vertex>
+      if (dot(normalize(cameraPosition - position), side) < -0.1)
+        gl_Position = vec4(2.0, 2.0, 2.0, 1.0);`);
+};
+layers.room.frustumCulled = false;
+layers.room.renderOrder = -1;
+scene.add(layers.room);
+
+function bytesOf(text) {
+  return Uint8Array.from(atob(text), character => character.charCodeAt(0));
+}
+
+function addToRoom({ from = 0, gone = [], origin, step, cell, steps, rgb, sides: seen }) {
+  const start = 3 * from, more = steps ? new Int16Array(bytesOf(steps).buffer) : [];
+  const sides = new Int8Array(start + more.length);
+  const places = new Float32Array(start + more.length), colours = new Float32Array(places.length);
+  places.set(room.places.subarray(0, start));
+  colours.set(room.colours.subarray(0, start));
+  sides.set(room.sides.subarray(0, start));
+  if (steps) sides.set(new Int8Array(bytesOf(seen).buffer), start);
+  const bytes = steps ? bytesOf(rgb) : [], linear = new THREE.Color();
+  for (let at = 0; at < more.length; at++) places[start + at] = origin[at % 3] + step * more[at];
+  for (let at = 0; at < bytes.length; at += 3)
+    linear.setRGB(bytes[at] / 255, bytes[at + 1] / 255, bytes[at + 2] / 255, "srgb")
+      .toArray(colours, start + at);
+  for (const row of gone) places.fill(NaN, 3 * row, 3 * row + 3);
+  Object.assign(room, { places, colours, sides, cell: cell ?? room.cell });
+}
+
+function drawRoom() {
+  const shape = new THREE.BufferGeometry();
+  shape.setAttribute("position", new THREE.Float32BufferAttribute(room.places, 3));
+  shape.setAttribute("color", new THREE.Float32BufferAttribute(room.colours, 3));
+  shape.setAttribute("side", new THREE.Float32BufferAttribute(
+    Float32Array.from(room.sides, value => value / 127), 3));
+  layers.room.material.size = 1.4 * room.cell;
+  layers.room.geometry.dispose();
+  layers.room.geometry = shape;
+  if (!hasChosenPoints && room.places.length) {
+    hiddenKinds.add("points");
+    document.querySelector("#switches [data-kind=points]").checked = false;
+    drawPoints();
+  }
+  dimRoom();
+}
+
+// The room steps back behind a chosen object. Its floor takes the place of the grid.
+function dimRoom() {
+  layers.room.visible = room.places.length > 0 && !hiddenKinds.has("room");
+  layers.room.material.opacity = (pointed ?? chosen) === null ? 1 : 0.35;
+  if (floor) floor.visible = room.places.length < 3000 || hiddenKinds.has("room");
+}
+
 function fill(layer, positions, colours, index) {
   const shape = new THREE.BufferGeometry();
   shape.setAttribute("position", new THREE.Float32BufferAttribute(positions, 3));
@@ -253,8 +316,8 @@ function measure() {
     high.max(new THREE.Vector3(...place));
   }
   if (low.x > high.x) { low.set(-1, -1, 0); high.set(1, 1, 1); }
-  const room = high.clone().sub(low);
-  reach = Math.max(room.x, room.y, room.z, 0.5);
+  const extent = high.clone().sub(low);
+  reach = Math.max(extent.x, extent.y, extent.z, 0.5);
   [camera.near, camera.far] = [Math.max(0.05, reach / 20000), Math.max(1000, 10 * reach)];
   camera.updateProjectionMatrix();
   // Lines on the floor, a metre apart.
@@ -355,6 +418,8 @@ function draw(...parts) {
     const parts = new Set(due);
     due.clear();
     if (parts.has("all")) measure();
+    if (parts.has("room")) drawRoom();
+    else if (parts.has("all") || parts.has("choice")) dimRoom();
     if (parts.has("all") || parts.has("choice")) {
       drawBoxes();
       drawArrows();
@@ -519,6 +584,7 @@ for (const box of document.querySelectorAll("#switches input")) {
   box.checked = !hiddenKinds.has(kind);
   box.onchange = () => {
     box.checked ? hiddenKinds.delete(kind) : hiddenKinds.add(kind);
+    if (kind === "points") hasChosenPoints = true;
     if (kind === "camera") {
       byId("camera").hidden = !box.checked || !byId("camera").src;
       tell({ images: box.checked });
@@ -675,6 +741,7 @@ function apply(message) {
   if (message.head || message.nodes || message.removed || message.edges || message.removedEdges)
     draw("all");
   if (message.clouds || message.removedClouds) draw("points");
+  if (message.surface) { addToRoom(message.surface); draw("room"); }
   if (message.path || message.camera) draw("camera");
 }
 
@@ -697,6 +764,7 @@ function connect() {
     // The server begins anew: what it does not send is gone.
     for (const map of [nodes, edges, clouds, photos]) map.clear();
     path = [];
+    addToRoom({});
     byId("lost").hidden = true;
     tell({ images: !hiddenKinds.has("camera"), moment });
   };

@@ -20,6 +20,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from deworldsg_ros.base.words import visible
+from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.view.live.camera import CameraView
 from deworldsg_ros.view.live.state import Guard, LiveState, LogOnce, OnError, PageView, scene_of
@@ -122,6 +123,12 @@ class Viewer:
             applied = self._state.apply(update)
         self._wake()
         return applied
+
+    def see(self, space: SeenSpace) -> None:
+        """Show the surface of the room of a saved graph."""
+        with self._lock:
+            self._state.see(space)
+        self._wake()
 
     def look(self, view: CameraView) -> None:
         """Show a frame of the camera; under load, frames are left out."""

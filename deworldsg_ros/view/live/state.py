@@ -11,7 +11,7 @@ import socket
 import zlib
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
@@ -21,11 +21,21 @@ import numpy as np
 from deworldsg_ros.client.objects import Point, SceneObject, scene_object
 from deworldsg_ros.graph.extent import DEFAULT_UP, surface_points
 from deworldsg_ros.graph.pairs import Pair
-from deworldsg_ros.scene.arrays import Float32, Float64
+from deworldsg_ros.graph.provenance import SeenSpace
+from deworldsg_ros.graph.surface import Surface
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt8, UInt16
+from deworldsg_ros.scene.frame_graph import GRID, LocalGraph
 from deworldsg_ros.scene.vocabulary import verb_of
 from deworldsg_ros.view.colours import class_colours, predicate_colours, view_axes
 from deworldsg_ros.view.live.camera import BestViews, CameraView, Shot, Shots, jpeg, with_masks
-from deworldsg_ros.view.page import cloud_values, edge_values, path_values, values_of, why
+from deworldsg_ros.view.page import (
+    cloud_values,
+    edge_values,
+    path_values,
+    surface_values,
+    values_of,
+    why,
+)
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import GraphReplica
 
@@ -267,6 +277,8 @@ class PageView:
     places: tuple[int, int] = (0, 0)
     camera_ns: int | None = None
     image_ns: int | None = None
+    surface: tuple[int, int] = (0, 0)
+    surface_gone: int = 0
     clouds_s: float = -math.inf
     image_s: float = -math.inf
 
@@ -296,6 +308,8 @@ class LiveState:
         self._colours: dict[int, str] = {}
         self._points: dict[int, Float32] = {}
         self._clouds: dict[int, tuple[Any, int, bytes]] = {}
+        self._space, self._surface = SeenSpace(), Surface()
+        self._surface_gone: list[int] = []  # rows, in the order in which they went
         self._places: list[tuple[int, Float64]] = []
         self._redrawn = 0  # how often the places became others
 
@@ -334,9 +348,48 @@ class LiveState:
         if len(self._places) > MOST_PLACES:
             self._places, self._redrawn = self._places[::2], self._redrawn + 1
         if view.local is not None:
+            if view.rgb is not None:
+                self._note(view.local, view.rgb)
             for node_id, points in zip(view.node_ids, view.local.surface_points_world):
                 known = self._points.get(node_id, np.zeros((0, 3), np.float32))
                 self._points[node_id] = np.concatenate([known, points])[-POINTS_OF_OBJECT:]
+
+    def see(self, space: SeenSpace) -> None:
+        """Take the views of a saved graph: the surface of its room."""
+        for view in zip(space.depths_mm, space.colours, space.cameras, space.poses):
+            self._add(*view)
+
+    def _note(self, local: LocalGraph, rgb: UInt8) -> None:
+        """Add the frame to the surface, if no view so far is like it."""
+        grid = local.depth_grid
+        if grid is None:
+            return
+        if grid.rgb is None and rgb.shape[:2] == (grid.intrinsics.height, grid.intrinsics.width):
+            grid = replace(grid, rgb=rgb[GRID, GRID])
+            local = replace(local, depth_grid=grid)
+        before = self._space.stamps_ns
+        self._space.note(local)
+        if self._space.stamps_ns is not before:
+            self._add(
+                *(
+                    part[-1]
+                    for part in (
+                        self._space.depths_mm,
+                        self._space.colours,
+                        self._space.cameras,
+                        self._space.poses,
+                    )
+                )
+            )
+
+    def _add(self, depth_mm: UInt16, rgb: UInt8, camera: Float64, pose: Float64) -> None:
+        begun, gone = self._surface.begun, self._surface.gone
+        self._surface.add(depth_mm, rgb, camera, pose)
+        if self._surface.begun != begun:
+            self._surface_gone = []
+        else:
+            new = np.flatnonzero(self._surface.gone[: len(gone)] & ~gone)
+            self._surface_gone += new.tolist()
 
     def recipe(self, page: PageView) -> tuple[Recipe, Point] | None:
         """What `scene_of` needs for a page in the past; None if nothing is to be made."""
@@ -371,6 +424,7 @@ class LiveState:
             *_changes("nodes", "removed", page.nodes, scene.nodes, lambda node_id: node_id),
             *_changes("edges", "removedEdges", page.edges, scene.edges, list),
             *self._head_news(page, scene),
+            *self._surface_news(page, now_s),
             *self._cloud_news(page, scene, now_s),
             *self._camera_news(page, scene, now_s),
         ]
@@ -393,6 +447,7 @@ class LiveState:
             self._up = up_of(newest)
             self._axes = view_axes(self._up)
             self._items, self._nodes, self._edges, self._clouds = {}, {}, {}, {}
+            self._surface.begun += 1  # its values are others, too
             self._redrawn += 1
         changed = False
         for node_id in self._items.keys() - newest.nodes.keys():
@@ -434,6 +489,8 @@ class LiveState:
             self._session = self.history.session
             self.crops, self._points, self._places = BestViews(), {}, []
             self._redrawn += 1
+            self._space, self._surface_gone = SeenSpace(), []
+            self._surface.clear()
 
     def _head_news(self, page: PageView, scene: Scene) -> list[str]:
         # A predicate keeps its colour: the first one that came is the first of the palette.
@@ -462,6 +519,24 @@ class LiveState:
             parts.append(f'"moments":{moments.decode()}')
         page.head, page.moments = head, moments
         return parts
+
+    def _surface_news(self, page: PageView, now_s: float) -> list[str]:
+        """The points of the room that a page lacks, and the rows of those that went."""
+        surface = self._surface
+        if now_s - page.clouds_s < CLOUDS_PERIOD_S:
+            return []
+        begun, count = page.surface
+        start, gone = (count, page.surface_gone) if begun == surface.begun else (0, 0)
+        went = self._surface_gone[gone:]
+        if (surface.begun, len(surface)) == page.surface and not went:
+            return []
+        page.surface, page.surface_gone = (surface.begun, len(surface)), len(self._surface_gone)
+        values = {"from": start, "gone": went}
+        if len(surface):
+            new = slice(start, None)
+            points = surface.points[new], surface.colours[new], surface.sides[new]
+            values |= surface_values(surface, points, self._axes)
+        return [f'"surface":{_json(values).decode()}']
 
     def _cloud_news(self, page: PageView, scene: Scene, now_s: float) -> list[str]:
         if now_s - page.clouds_s < CLOUDS_PERIOD_S:
