@@ -250,13 +250,18 @@ def read_graph(path: Path) -> wire.SceneGraphMessage:
         raise RefusedInput(refusal.reason, f"scene graph {path}: {refusal}") from refusal
 
 
+def graph_path(path: Path) -> Path:
+    """The file of a scene graph: itself, or ``scene_graph.json`` of a folder."""
+    return path / GRAPH_FILE if path.is_dir() else path
+
+
 def read_content(path: Path) -> bytes:
     """The text of a scene graph: a file, or ``scene_graph.json`` of a folder.
 
     Raises:
         RefusedInput: ``unreadable_graph``.
     """
-    path = path / GRAPH_FILE if path.is_dir() else path
+    path = graph_path(path)
     try:
         return read_regular(path, MAX_GRAPH_BYTES)
     except OSError as error:
