@@ -236,6 +236,10 @@ def edit_map(path: Path, request: EditRequest) -> EditReply:
             f"map {path} is {what}no map: expected a file that graph_node (map_path) or `deworldsg "
             "run RECORDING --out OUT --map FILE` has written"
         )
+    try:  # a request that was made without its limits would be in the map
+        request = msgspec.convert(msgspec.to_builtins(request), type(request))
+    except msgspec.ValidationError as error:
+        raise RefusedInput("invalid_request", str(error)) from error
     lock = claim_map(path)
     try:
         of_paper = MergingConfig(association="paper")

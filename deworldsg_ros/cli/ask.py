@@ -32,9 +32,11 @@ from deworldsg_ros.client.objects import SURE, odds_of
 from deworldsg_ros.client.questions import Answers, ask
 from deworldsg_ros.graph.edits import DeleteNode, EditRequest, MergeNodes, SetLabel, SplitNode, Undo
 from deworldsg_ros.graph.extent import DEFAULT_UP
+from deworldsg_ros.graph.graph_files import graph_path
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import rigid_motion
 from deworldsg_ros.scene.errors import ClientError
+from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M
 from deworldsg_ros.scene.vocabulary import PREDICATES
 from deworldsg_ros.scene.vocabulary import plain as plain_name
 from deworldsg_ros.wire import messages as wire
@@ -44,7 +46,7 @@ if TYPE_CHECKING:
 
 # Words between the two objects of a relation, the longest first.
 _PREDICATES = {"and", *(plain_name(name) for names in PREDICATES for name in names)}
-_BETWEEN = re.compile(rf"\s+(?:{'|'.join(sorted(_PREDICATES, key=len, reverse=True))})\s+")
+_BETWEEN = re.compile(rf" (?:{'|'.join(sorted(_PREDICATES, key=len, reverse=True))}) ")
 
 # --- `deworldsg query`, `goal` and `explain`: ask a scene graph.
 
@@ -210,7 +212,7 @@ def _with_looks(client: SceneGraphClient) -> SceneGraph:
 
 def _pair(graph: SceneGraph, words: list[str]) -> tuple[int | str, int | str] | None:
     """Two objects that the words name, in two arguments or with a relation between; None = one."""
-    text = " ".join(words)
+    text = " ".join(" ".join(words).split())
     between = _BETWEEN.split(text, maxsplit=1)
     parts = between if len(between) == 2 else words
     if len(parts) != 2 or _is_known(graph, text) or place_of(text, graph.up):
@@ -413,6 +415,8 @@ def merge(
 ) -> None:
     """Merge a scene graph into another one: objects at one place become one."""
     a, b = SceneGraph.load(first), SceneGraph.load(second)
+    if output.resolve() in (graph_path(first).resolve(), graph_path(second).resolve()):
+        raise ClientError(f"{output} is one of the graphs to merge: expected another file")
     combined = combine(a, b, _transform(transform, a) if transform else None)
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -439,4 +443,8 @@ def _transform(text: str, a: SceneGraph) -> Float64:
         x, y, z, degrees = map(float, parts)
     except ValueError as error:
         raise ClientError(f"--transform {text}: expected four numbers X,Y,Z,DEGREES") from error
+    if not (max(map(abs, (x, y, z))) <= MAX_GRAPH_COORDINATE_M and abs(degrees) <= 360.0):
+        raise ClientError(
+            f"--transform {text}: expected at most {MAX_GRAPH_COORDINATE_M:g} m and 360 degrees"
+        )
     return rigid_motion(np.array([x, y, z]), math.radians(degrees) * np.array(a.up))

@@ -39,7 +39,10 @@ Settings = Annotated[
     typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="set one option; may be repeated"),
 ]
 MaxFrames = Annotated[
-    int, typer.Option("--max-frames", min=0, help="stop after this many frames; 0 = all frames")
+    int,
+    typer.Option(
+        "--max-frames", min=0, max=10**9, help="stop after this many frames; 0 = all frames"
+    ),
 ]
 RgbTopic = Annotated[
     str, typer.Option("--rgb", metavar="TOPIC", help="topic of the RGB images in a bag")

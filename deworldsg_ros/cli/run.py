@@ -61,7 +61,12 @@ from deworldsg_ros.recordings.recording import Recording, detect_kind, open_sour
 from deworldsg_ros.recordings.source import RawRoleMessage, Role, Source
 from deworldsg_ros.recordings.writer import check_output, write_mcap
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.errors import DeWorldSGError, RecordingError, RefusedInput
+from deworldsg_ros.scene.errors import (
+    ConfigurationError,
+    DeWorldSGError,
+    RecordingError,
+    RefusedInput,
+)
 from deworldsg_ros.view.photos import Album
 from deworldsg_ros.wire import messages as wire
 
@@ -170,6 +175,11 @@ def _check_paths(options: RunOptions) -> None:
     if options.trajectory_out is not None:
         files.append(("the trajectory", options.trajectory_out))
     check_paths(options.map_path, files)
+    source = options.recording.resolve()
+    written = [*files, *([("the map", options.map_path)] if options.map_path is not None else [])]
+    for what, path in written:
+        if path.exists() and (path.resolve() == source or source in path.resolve().parents):
+            raise ConfigurationError(f"{what} would replace {path}, which is of the recording")
 
 
 def examine(options: RunOptions, console: Console) -> list[Finding]:

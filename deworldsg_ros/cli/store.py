@@ -102,8 +102,8 @@ def at(
 def rebuild(store: Folder) -> None:
     """Make the database anew from the messages of the store."""
     Store(store)  # refuses a folder that is no store
-    with StoreWriter(store) as writer:
-        writer.rebuild()
+    with StoreWriter(store, anew=True):
+        pass
     typer.echo(f"{store}: the database is made anew")
 
 

@@ -20,7 +20,7 @@ from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.scene.camera import check_pose, pose_from_quaternion, quaternion_from_rotation
 from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.scene.gaussian import fuse, transform
-from deworldsg_ros.scene.limits import MAX_INT
+from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M, MAX_INT
 from deworldsg_ros.wire import messages as wire
 
 # --- Finds how the world frame of one graph lies in that of another, from the objects of both.
@@ -409,6 +409,10 @@ def moved_object(item: SceneObject, T: Float64, frame_id: str, up: Point) -> Sce
     points = surface_points(state) @ T[:3, :3].T + T[:3, 3]
     turn = pose_from_quaternion(np.zeros(3), np.array(item.orientation_xyzw))[:3, :3]
     place = rounded(T[:3, :3] @ item.position_m + T[:3, 3], 3)
+    if not max(np.abs(means).max(), np.abs(place).max()) <= MAX_GRAPH_COORDINATE_M:
+        raise ClientError(
+            f"{item.name} would be at {place}: expected at most {MAX_GRAPH_COORDINATE_M:g} m"
+        )
     turned = rounded(quaternion_from_rotation(T[:3, :3] @ turn), 4)
     new = msgspec.structs.replace(
         state,
@@ -447,7 +451,7 @@ def _fused(a: SceneObject, b: SceneObject) -> wire.NodeState:
     named = [item.label for item in (a, b) if item.is_named]
     return msgspec.structs.replace(
         a.state,
-        label=best[0][0] if len(named) == 2 else (*named, a.label)[0],
+        label=best[0][0] if best and len(named) == 2 else (*named, a.label)[0],
         named=bool(named),
         classes=[wire.Belief(label, round(value, 4)) for label, value in best],
         remainder=round(max(0.0, 1.0 - sum(value for _, value in best)), 4),

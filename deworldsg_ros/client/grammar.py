@@ -10,6 +10,7 @@ from typing import Literal
 from deworldsg_ros.client.meanings import COLOUR_WORDS, KNOWN
 from deworldsg_ros.client.objects import Point
 from deworldsg_ros.scene.errors import ClientError
+from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M
 from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 
 #     question  = "what changed" [ "since" time ] | "like" text
@@ -273,6 +274,8 @@ class _Reader:
             self.tokens.pop(0)
         if self.tokens[:1] == ["not"]:
             self.tokens.pop(0)
+            if not self.tokens:
+                raise ClientError(f"question '{self.question}': not what? expected a condition")
             return replace(self.condition(), is_negated=True)
         if self.tokens and self._is_colour():
             return Condition(own_colour=COLOUR_WORDS[self.tokens.pop(0)])
@@ -319,14 +322,20 @@ class _Reader:
         if match is None:
             raise ClientError(f"question '{self.question}': '{text}' is no length such as 0.5 m")
         unit = match[2] or (self.tokens.pop(0) if self.tokens[:1] in (["m"], ["cm"]) else "m")
-        return float(match[1]) * (0.01 if unit == "cm" else 1.0)
+        return self._metres(float(match[1]) * (0.01 if unit == "cm" else 1.0))
+
+    def _metres(self, value: float) -> float:
+        if not abs(value) <= MAX_GRAPH_COORDINATE_M:
+            most = f"at most {MAX_GRAPH_COORDINATE_M:g} m"
+            raise ClientError(f"question '{self.question}': {value:g} m: expected {most}")
+        return value
 
     def _point(self) -> Point:
         text = self.tokens.pop(0)
         numbers = re.findall(_NUMBER, text)
         if len(numbers) != 3:
             raise ClientError(f"question '{self.question}': '{text}' is no point (x, y, z)")
-        x, y, z = map(float, numbers)
+        x, y, z = (self._metres(float(number)) for number in numbers)
         return x, y, z
 
     def _at_condition(self, at: int = 0) -> bool:

@@ -100,12 +100,14 @@ class SceneGraphClient:
 
     Attributes:
         refused: number of messages that could not be read.
+        on_refused: called with the reason for each of them; None = the log has it.
     """
 
     def __init__(
         self, namespace: str = "", context: Context | None = None, *, embeddings: bool = False
     ) -> None:
         self.refused = 0
+        self.on_refused: Callable[[RefusedInput], object] | None = None
         self._own_context = context is None
         self._context = context if context is not None else Context()
         self._namespace = namespace.rstrip("/")
@@ -353,6 +355,9 @@ class SceneGraphClient:
                         self._changed.notify_all()
             except RefusedInput as refusal:
                 self.refused += 1
+                if self.on_refused is not None:
+                    self.on_refused(refusal)
+                    return
                 logger = self._node.get_logger()
                 logger.warning(visible(str(refusal)), throttle_duration_sec=LOG_PERIOD_S)
                 return
@@ -421,6 +426,8 @@ class SceneGraphClient:
             future.add_done_callback(lambda _: arrived.set())
             while not arrived.wait(STEP_S):
                 self._check_can_wait()
+                if not client.service_is_ready():
+                    raise ClientError(f"no answer of {client.srv_name}: its node has ended")
                 if time.monotonic() > end_s:
                     raise ClientError(f"no answer of {client.srv_name} within {TIMEOUT_S:g} s")
             response = future.result()

@@ -29,6 +29,8 @@ UNDER = frozenset({"under", "below"})
 # The most that one question may cost: objects that are compared, and seconds. A question that a
 # person asks of ten thousand objects compares a tenth of it.
 MOST_COMPARED, LIMIT_S = 1_000_000, 2.0
+# Seconds of a time that is asked for: stamps reach as far.
+MOST_S = 1e10
 
 
 class _Budget:
@@ -299,8 +301,8 @@ def since_ns(graph: SceneGraph, since: Since) -> int:
     """
     if since.time_s is None:
         return 0
-    if not math.isfinite(since.time_s):
-        raise ClientError(f"time {since.time_s}: expected a finite number of seconds")
+    if not 0.0 <= since.time_s < MOST_S:
+        raise ClientError(f"time {since.time_s:g}: expected at most {MOST_S:g} seconds")
     time_ns = round(since.time_s * 1e9)
     return graph.stamp_ns - time_ns if since.ago else time_ns
 

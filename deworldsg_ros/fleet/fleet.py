@@ -195,8 +195,8 @@ def _added(whole: SceneGraph, member: Member) -> tuple[SceneGraph, dict[int, int
     try:
         combined = combine(whole, member.graph, member.T_fleet_world, member.known)
         joined = SceneGraph(combined.message)
-    except (DeWorldSGError, ValueError) as error:  # of one robot: the others go on
-        member.T_fleet_world, member.reason = None, str(error)
+    except Exception as error:  # of one robot, whose graph may be anything: the others go on
+        member.T_fleet_world, member.reason = None, f"{type(error).__name__}: {error}"
         return whole, {}
     return joined, combined.ids
 

@@ -39,14 +39,20 @@ PATIENCE_S = 10.0
 GONE_S = 60.0
 
 
-def open_session(connect: str = "", listen: str = "") -> Any:
+class NoRouterError(ConfigurationError):
+    """No router answers yet."""
+
+
+def open_session(connect: str = "", listen: str = "", wait_s: float | None = None) -> Any:
     """A Zenoh session. It does not search the network for other routers.
 
     Args:
         connect: endpoints of routers, e.g. ``tcp/10.0.0.5:7447``, separated by commas.
         listen: endpoints on which this process is a router itself; empty = it is none.
+        wait_s: how long a router that is not there yet is waited for; None = without end.
 
     Raises:
+        NoRouterError: if none has answered in this time.
         ConfigurationError: without the package eclipse-zenoh, for an endpoint that cannot be read,
             or one that is in use.
     """
@@ -61,8 +67,8 @@ def open_session(connect: str = "", listen: str = "") -> Any:
         for key, value in {
             "mode": "router" if listen else "client",
             "connect/endpoints": _endpoints(connect),
-            # A router that is not there yet is waited for.
-            "connect/timeout_ms": 0 if listen else -1,
+            # A router that is not there yet is waited for, deaf to signals, unless for a while.
+            "connect/timeout_ms": 0 if listen else -1 if wait_s is None else round(1000 * wait_s),
             "connect/exit_on_failure": False,
             "listen/endpoints": _endpoints(listen),
             "scouting/multicast/enabled": False,
@@ -70,7 +76,8 @@ def open_session(connect: str = "", listen: str = "") -> Any:
             config.insert_json5(key, json.dumps(value))
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise ConfigurationError(
+        kind = NoRouterError if "Unable to connect" in str(error) else ConfigurationError
+        raise kind(
             f"no Zenoh session with connect {connect!r} and listen {listen!r}: {error}"
         ) from error
 

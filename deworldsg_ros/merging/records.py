@@ -356,6 +356,8 @@ class NodeRecords:
         if "scores" in memory and memory["scores"].ndim == 2:  # of an older release: one of a cell
             both = np.repeat(memory["scores"][:, None], SCORES, axis=1)
             memory = {**memory, "scores": both}
+        if "records" not in memory:
+            raise ValueError("the map has no records: it is damaged")
         memory = {**memory, "records": _with_certainties(memory["records"])}
         check_memory(memory, RECORD, len(graph.vocabulary.classes))
         records, counts = memory["records"], memory["block_counts"]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 
 from deworldsg_ros.client.live import SceneGraphClient
 from deworldsg_ros.fleet.zenoh_link import (
     ROBOT_NAME,
     Feed,
     Follower,
+    NoRouterError,
     open_session,
     part_key,
     robot_key,
@@ -20,6 +21,18 @@ from deworldsg_ros.ros.options import FleetLinkParameters
 from deworldsg_ros.ros.threads import Repeating
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.wire.follow import ChangeLog
+
+# A router is looked for so long, again and again: meanwhile signals and diagnostics are served.
+CONNECT_S = 1.0
+
+
+class _Link(NamedTuple):
+    """The connection to the fleet."""
+
+    session: Any
+    feed: Feed
+    follower: Follower
+    token: Any
 
 
 class FleetLinkNode(StageNode):
@@ -39,13 +52,11 @@ class FleetLinkNode(StageNode):
                 f"fleet_link_node: parameter robot is {settings.robot!r}: expected a name of "
                 "letters, digits, _ and -, unique in the fleet"
             )
-        self._session = open_session(connect=settings.connect)
         self._client = SceneGraphClient(self.get_namespace(), self.context).__enter__()
+        self._client.on_refused = lambda refusal: self.drop(refusal.reason, str(refusal))
         self._log = ChangeLog()
-        key = robot_key(settings.robot)
-        self._feed = Feed(self._session, key, self._log, self.guarded(self._refresh))
-        self._token = self._session.liveliness().declare_token(key)
-        self._follower = Follower(self._session, part_key(settings.robot))
+        self._link: _Link | None = None
+        self._connect()
         self._others = GraphTopics(self, "others")
         self._is_connected = False
         self._loop = Repeating(self, self._ask, settings.period_s)
@@ -54,7 +65,8 @@ class FleetLinkNode(StageNode):
         """End the thread and the connections."""
         self._loop.stop()
         self._client.close()
-        self._session.close()
+        if self._link is not None:
+            self._link.session.close()
         super().close()
 
     def waiting_for(self, now_ns: int) -> list[str]:
@@ -68,10 +80,13 @@ class FleetLinkNode(StageNode):
 
     def more_values(self) -> dict[str, str]:
         """Bytes on the wire."""
+        link = self._link
+        if link is None:
+            return {}
         return {
-            "bytes sent": str(self._feed.sent_bytes),
-            "bytes received": str(self._follower.received_bytes),
-            "objects of others": str(len(self._follower.replica.nodes)),
+            "bytes sent": str(link.feed.sent_bytes),
+            "bytes received": str(link.follower.received_bytes),
+            "objects of others": str(len(link.follower.replica.nodes)),
         }
 
     def _refresh(self) -> None:
@@ -79,11 +94,31 @@ class FleetLinkNode(StageNode):
         if graph is not None:
             self._log.set(graph.message)
 
+    def _connect(self) -> None:
+        """Look for a router; `waiting_for` says if there is none yet."""
+        settings = self.parameters.node
+        try:
+            session = open_session(connect=settings.connect, wait_s=CONNECT_S)
+        except NoRouterError:
+            return
+        key = robot_key(settings.robot)
+        self._link = _Link(
+            session,
+            Feed(session, key, self._log, self.guarded(self._refresh)),
+            Follower(session, part_key(settings.robot)),
+            session.liveliness().declare_token(key),
+        )
+
     def _ask(self) -> None:
-        changed = self._follower.ask(self.parameters.node.period_s + 1.0)
+        if self._link is None:
+            self._connect()
+        if self._link is None:
+            return
+        follower = self._link.follower
+        changed = follower.ask(self.parameters.node.period_s + 1.0)
         self._is_connected = changed is not None
         if changed:
-            self._others.publish(self._follower.replica.message())
+            self._others.publish(follower.replica.message())
             self.health.published()
 
 

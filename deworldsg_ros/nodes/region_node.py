@@ -42,6 +42,7 @@ class RegionNode(StageNode):
         self._part = RegionPart(self._region)
         self._topics = GraphTopics(self, "region")
         self._client = SceneGraphClient(self.get_namespace(), self.context)
+        self._client.on_refused = lambda refusal: self.drop(refusal.reason, str(refusal))
         self._client.on_message(self.guarded(self._add))
         self._client.__enter__()
         self.create_subscription(

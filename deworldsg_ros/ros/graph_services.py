@@ -128,6 +128,7 @@ class GraphServices:
     def _serve(self, name: str, kind: Any, answer: _Answer) -> None:
         async def call(request: Any, response: Any) -> Any:
             if self._waiting >= MOST_WAITING:
+                self._node.drop("busy", f"{name}: {BUSY}")
                 response.success, response.message = False, BUSY
                 return response
             done = Future()
@@ -136,7 +137,7 @@ class GraphServices:
             try:
                 self._graph.submit(
                     lambda: self._answer(name, partial(answer, text), done),
-                    lambda: self._done(done, (False, "too many messages wait: try again")),
+                    lambda: self._refuse_busy(name, done),
                 )
                 response.success, response.message = await done
             finally:
@@ -163,6 +164,10 @@ class GraphServices:
                     self._questions.submit(partial(self._answer, name, said, done))
         if result is not None:
             self._done(done, result)
+
+    def _refuse_busy(self, name: str, done: Future) -> None:
+        self._node.drop("busy", f"{name}: too many messages wait")
+        self._done(done, (False, "too many messages wait: try again"))
 
     def _done(self, done: Future, result: tuple[bool, str]) -> None:
         done.set_result(result)

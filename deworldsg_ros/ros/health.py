@@ -283,6 +283,8 @@ REASONS: dict[str, str] = {
     "(odometry_node: a second). A jump of one message costs this message. If the next message "
     "confirms it, the node continues at the new time: a recording was restarted, or a clock was "
     "set.",
+    "busy": "Eight service calls wait for their answers, or the graph has more work than it can "
+    "do. A further call is refused at once; it may be tried again.",
     "overrun": "Frames arrive faster than a node processes them. It dropped the oldest in its "
     "queue. Lower the camera's frame rate, or choose a faster model.",
     "evidence_overrun": "As `overrun`, for relation evidence. The graph has its frame without it.",

@@ -170,7 +170,7 @@ class RegionOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         option("centre as X,Y,Z in the world frame, metres; empty = follow region/center"),
     ] = ""
     radius_m: Annotated[
-        float, option("largest distance of the centre of an object's box, metres", gt=0)
+        float, option("largest distance of the centre of an object's box, metres", gt=0, le=1e6)
     ] = 5.0
     classes: Annotated[
         str, option("classes, separated by commas; table means dining table too; empty = all")

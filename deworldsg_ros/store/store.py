@@ -37,7 +37,8 @@ from deworldsg_ros.wire import messages as wire
 GraphMessage = wire.SceneGraphMessage | wire.SceneGraphUpdateMessage
 # Of the end of the file that are searched at a time for the end of a line.
 _BLOCK = 1 << 20
-# How the line of an update begins.
+# How a line begins, and that of an update.
+_BEGIN = b'{"schema":'
 _UPDATE = b'{"schema":' + msgspec.json.encode(wire.schema_of(wire.SceneGraphUpdateMessage))[:-1]
 _UPDATE = _UPDATE.partition(b',"version"')[0]
 
@@ -56,7 +57,24 @@ class Journal:
     def __init__(self, path: Path) -> None:
         check_regular(path)
         self._file = path.open("ab")
-        self._file.truncate(_end_of_lines(path))
+        size, end = self.size, _end_of_lines(path)
+        if end < size:
+            self._mend(path, end)
+
+    def _mend(self, path: Path, end: int) -> None:
+        """Complete the last line, or drop it if a killed writer cut it off."""
+        with path.open("rb") as file:
+            if file.read(len(_BEGIN)) != _BEGIN:
+                raise StoreError(f"{path} has no messages of a store: expected {_BEGIN.decode()}…")
+            file.seek(end)
+            last = file.read()
+        try:
+            decode(last)
+        except RefusedInput:
+            self._file.truncate(end)
+        else:
+            self._file.write(b"\n")
+            self._file.flush()
 
     @property
     def size(self) -> int:
@@ -302,6 +320,8 @@ def _time_ns(text: str, newest_ns: int) -> int:
 # --- Writes a store, and asks it.
 
 MESSAGES_FILE, DATABASE_FILE = "messages.jsonl", "graph.lbug"
+# Of the files beside it.
+_OF_DATABASE = (".wal", ".shadow", ".tmp", ".writing", ".checkpoint")
 # Messages that go to the database at a time when it is made anew.
 _MESSAGES_AT_A_TIME = 500
 
@@ -435,18 +455,23 @@ class StoreWriter:
 
     Args:
         folder: of the store; it is made if it is missing.
+        anew: whether the database is made anew from the messages.
 
     Raises:
         OSError: if it cannot be written, or another process writes it.
-        StoreError: if a line of its messages is damaged.
+        StoreError: if a line of its messages is damaged, or lines are missing.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, anew: bool = False) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._path, self._messages = folder / DATABASE_FILE, folder / MESSAGES_FILE
         self._lock = FileLock(self._messages)
         try:
             self._journal = Journal(self._messages)
+            if anew:
+                for _ in read_messages(self._messages):  # all of them, before the database goes
+                    pass
+                self._remove()
             self._load()
         except BaseException:
             self._lock.release()
@@ -492,11 +517,12 @@ class StoreWriter:
         ):
             self._write(database)
 
-    def rebuild(self) -> None:
-        """Make the database anew from the messages."""
+    def _remove(self) -> None:
+        """Remove the files of the database, and no others beside them."""
         for path in self._path.parent.glob(f"{self._path.name}*"):
-            path.unlink()
-        self._load()
+            rest = path.name.removeprefix(self._path.name)
+            if not rest or rest.startswith(_OF_DATABASE):
+                path.unlink()
 
     def _add(self, message: GraphMessage, content: bytes) -> bool:
         is_new = self._batch.follows(message)
@@ -514,8 +540,7 @@ class StoreWriter:
                     return
         except RuntimeError:
             pass  # it is damaged, or of another version of ladybug
-        for path in self._path.parent.glob(f"{self._path.name}*"):
-            path.unlink()
+        self._remove()
         with (
             _of_database(self._path, "written"),
             opened(self._path, read_only=False) as database,
@@ -527,8 +552,14 @@ class StoreWriter:
     def _continue(self, database: Database) -> bool:
         """Read the head and the stays, and catch up; False if it is no database of a store."""
         head = database.head()
-        if head is None or head.position > self._journal.size:
+        if head is None:
             return False
+        if head.position > self._journal.size:
+            raise StoreError(
+                f"{self._messages} has {self._journal.size} bytes, and the database knows "
+                f"{head.position}: it was cut; `deworldsg store rebuild {self._path.parent}` makes "
+                "the database of what is left"
+            )
         history = History(database.current_stays(), database.next_key())
         self._batch = Batch(head, history)
         with paused_collector():

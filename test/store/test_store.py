@@ -90,8 +90,8 @@ def test_the_database_is_the_graph_after_every_commit(tmp_path, seed):
     store = Store(tmp_path)
     assert content(store) == expected(graphs[-1])
     before = store.ask("MATCH (s:Stay) RETURN s.* ORDER BY s.key").rows
-    with StoreWriter(tmp_path) as writer:
-        writer.rebuild()
+    with StoreWriter(tmp_path, anew=True):
+        pass
     assert content(store) == expected(graphs[-1])
     assert store.ask("MATCH (s:Stay) RETURN s.* ORDER BY s.key").rows == before
     replica = GraphReplica()
@@ -283,7 +283,7 @@ def test_a_line_that_was_cut_off_is_dropped_and_a_damaged_one_is_named(tmp_path)
     lines[1] = b'{"schema": 3}\n'
     messages.write_bytes(b"".join(lines))
     with pytest.raises(StoreError, match=f"byte {len(lines[0])}"):
-        StoreWriter(tmp_path).rebuild()
+        StoreWriter(tmp_path, anew=True)
 
 
 @pytest.mark.parametrize(
@@ -358,6 +358,37 @@ def test_a_full_disk_is_one_line_and_loses_no_message(tmp_path):
         written(tmp_path, graph(2, 2.0, [node(i) for i in range(1, 3000)]))
     written(tmp_path, graph(3, 3.0, [node(1), node(2)]))
     assert len(store.ask("MATCH (o:Object) RETURN o.id").rows) == 2
+
+
+def test_a_last_line_without_its_end_is_kept_and_a_cut_file_is_named(tmp_path):
+    store = written(tmp_path, graph(1, 10.0, [node(1)]), graph(2, 11.0, [node(1), node(2)]))
+    messages, database = tmp_path / MESSAGES_FILE, tmp_path / "graph.lbug"
+    whole = messages.read_bytes()
+    messages.write_bytes(whole[:-1])
+    with StoreWriter(tmp_path):
+        pass
+    assert messages.read_bytes() == whole
+    messages.write_bytes(b"")
+    with pytest.raises(StoreError, match="was cut"), StoreWriter(tmp_path):
+        pass
+    assert database.is_file()
+    messages.write_bytes(whole + b"{}\n")
+    with pytest.raises(StoreError, match="byte"), StoreWriter(tmp_path, anew=True):
+        pass
+    assert database.is_file()
+    messages.write_bytes(whole)
+    notes = tmp_path / "graph.lbug_notes.txt"
+    notes.write_text("mine")
+    with StoreWriter(tmp_path, anew=True):
+        pass
+    assert notes.read_text() == "mine" and len(content(store)[0]) == 2
+
+
+def test_a_file_of_others_is_not_emptied(tmp_path):
+    (tmp_path / MESSAGES_FILE).write_text("my diary")
+    with pytest.raises(StoreError, match="no messages"), StoreWriter(tmp_path):
+        pass
+    assert (tmp_path / MESSAGES_FILE).read_text() == "my diary"
 
 
 def test_one_writer_at_a_time_and_readers_meanwhile(tmp_path):

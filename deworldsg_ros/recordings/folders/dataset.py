@@ -37,6 +37,10 @@ MAX_FILE_BYTES = 2 << 30
 DEPTH_SOURCES = ("auto", "rendered", "sensor")
 
 
+# Frames a second of a camera.
+LEAST_HZ, MOST_HZ = 1e-3, 1e4
+
+
 @dataclass(frozen=True)
 class DatasetOptions:
     """Information that a folder may not contain.
@@ -50,7 +54,7 @@ class DatasetOptions:
             pose.
 
     Raises:
-        RecordingError: for another depth source.
+        RecordingError: for another depth source, or a rate that no camera has.
     """
 
     rate_hz: float = 0.0
@@ -59,6 +63,11 @@ class DatasetOptions:
     poses_needed: bool = True
 
     def __post_init__(self) -> None:
+        if self.rate_hz and not LEAST_HZ <= self.rate_hz <= MOST_HZ:
+            raise RecordingError(
+                f"rate is {self.rate_hz:g} frames a second: expected 0, or {LEAST_HZ:g} to "
+                f"{MOST_HZ:g}"
+            )
         if self.depth_source not in DEPTH_SOURCES:
             raise RecordingError(
                 f"depth source '{self.depth_source}': expected {', '.join(DEPTH_SOURCES)}"
