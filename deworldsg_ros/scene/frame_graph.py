@@ -130,9 +130,9 @@ class FrameGraph:
 
     def __post_init__(self) -> None:
         count = len(self.boxes_xyxy)
-        if self.rgb_grid is not None:
-            height, width = len(range(self.height)[GRID]), len(range(self.width)[GRID])
-            checks.check_shape("colour grid", self.rgb_grid, (height, width, 3))
+        shape = len(range(self.height)[GRID]), len(range(self.width)[GRID]), 3
+        if self.rgb_grid is not None and self.rgb_grid.shape != shape:
+            raise ValueError(f"colour grid is {self.rgb_grid.shape}: expected {shape}")
         if self.embeddings is not None:
             self.embeddings.check_rows(count)
         checks.check_boxes(self.boxes_xyxy, count)
@@ -178,8 +178,8 @@ class DepthGrid:
         checks.check_shape("depth grid", self.depth_mm, shape)
         if self.instances is not None:
             checks.check_shape("instances of the depth grid", self.instances, shape)
-        if self.rgb is not None:
-            checks.check_shape("colours of the depth grid", self.rgb, (*shape, 3))
+        if self.rgb is not None and self.rgb.shape != (*shape, 3):
+            raise ValueError(f"colours of the depth grid are {self.rgb.shape}: expected {shape}")
 
 
 @dataclass(frozen=True)

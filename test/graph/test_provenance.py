@@ -198,7 +198,7 @@ def test_maps_and_saved_graphs_have_both(tmp_path: Path, walk: GraphBuilder) -> 
     assert len(again.frames.all(again.graph)) == len(walk.frames.all(walk.graph)) > 0
     one, other = copy_state(again), copy_state(walk)
     kept = [name for name in one if name.startswith(("view_", "seen_frames"))]
-    assert len(kept) == 5 and all(one[name].tobytes() == other[name].tobytes() for name in kept)
+    assert len(kept) == 6 and all(one[name].tobytes() == other[name].tobytes() for name in kept)
     path = write_graph(tmp_path, walk.full())
     assert SceneGraph.load(tmp_path).goal_near("cup").seen_free is None
     provenance.write_space(path, walk.space)

@@ -6,9 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 from support.browser import browser, opened_page, pixels_of, until
+from support.merging import local_graph
 from support.view import SAVED, make_edge, make_graph, make_node
 
 from deworldsg_ros.client import SceneGraph
+from deworldsg_ros.graph.provenance import SeenSpace
+from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.view import page
 from deworldsg_ros.wire import messages as wire
 
@@ -111,6 +115,31 @@ def test_an_empty_graph_says_why(chromium, tmp_path):
     hidden = [wire.HiddenNode("cup", [0, 0, 0], 0.2, 1, "seen in too few frames")] * 3
     with opened_page(chromium, url_of(make_graph(hidden=hidden), tmp_path)) as shown:
         assert "3: seen in too few frames" in shown.locator("#empty").inner_text()
+
+
+def test_the_room_is_drawn_and_steps_back_behind_a_chosen_object(chromium, tmp_path):
+    space = SeenSpace()
+    camera = Intrinsics(480.0, 480.0, 320.0, 240.0, 640, 480)
+    rgb = np.full((60, 80, 3), (180, 20, 20), np.uint8)
+    grid = DepthGrid(np.full((60, 80), 2000, np.uint16), 8, camera, None, rgb)
+    nothing = np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4))
+    T = np.eye(4)
+    T[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # it looks along +y
+    space.note(local_graph(1, *nothing, depth_grid=grid, T_world_camera=T))
+    path = tmp_path / "graph.html"
+    page.write(make_graph([make_node(1, "cup", (0, 1.9, 0))]), path, space=space)
+    with opened_page(chromium, path.as_uri()) as shown:
+        until(shown, "layers.room.visible && room.places.length === 3 * 4800", "the room")
+        shown.evaluate("camera.position.set(0, -1, 0.2), controls.target.set(0, 2, 0)")
+        shown.evaluate("hiddenKinds.add('boxes'), controls.update(), draw('choice')")
+        red = np.abs(pixels(shown) - (180, 20, 20)).max(axis=2) < 40
+        assert red.mean() > 0.03
+        shown.evaluate("camera.position.set(0, 5, 0.2), controls.update(), draw()")
+        assert (np.abs(pixels(shown) - (180, 20, 20)).max(axis=2) < 40).mean() < 0.01  # from behind
+        shown.evaluate("choose(1)")
+        until(shown, "layers.room.material.opacity < 0.5", "it steps back")
+        shown.locator("#switches label", has_text="room").click()
+        until(shown, "!layers.room.visible", "it is hidden")
 
 
 def test_names_are_text_whatever_they_contain(chromium, tmp_path):

@@ -102,7 +102,8 @@ def random_depth_grid(rng: np.random.Generator) -> DepthGrid | None:
     depth_mm = rng.integers(0, 2**16, shape).astype(np.uint16)
     instances = rng.integers(0, 5, shape).astype(np.uint16) if rng.random() < 0.5 else None
     intrinsics = Intrinsics(*rng.uniform(1, 900, 4).tolist(), 640, 480)
-    return DepthGrid(depth_mm, stride_px, intrinsics, instances)
+    rgb = rng.integers(0, 256, (*shape, 3)).astype(np.uint8) if rng.random() < 0.5 else None
+    return DepthGrid(depth_mm, stride_px, intrinsics, instances, rgb)
 
 
 def random_local_graph(rng: np.random.Generator) -> LocalGraph:

@@ -6,15 +6,17 @@ import json
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from support.merging import local_graph
 from support.view import box_at, make_edge, make_graph, make_node, random_graphs, updates_of
 
 from deworldsg_ros.client.objects import scene_object
+from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.view.live.camera import CameraView, Crop
+from deworldsg_ros.view.live.history import BLOCK, History
 from deworldsg_ros.view.live.state import (
-    BLOCK,
     CLOUDS_PERIOD_S,
-    History,
     LiveState,
     PageView,
     scene_of,
@@ -37,6 +39,7 @@ class Page:
         self.state, self.view, self.now_s = state, PageView(), 0.0
         self.nodes, self.edges, self.clouds, self.head, self.path = {}, {}, {}, {}, []
         self.camera, self.photos, self.images, self.moments = None, {}, [], {}
+        self.surface, self.gone = None, []
 
     def look(self, after_s=CLOUDS_PERIOD_S):
         """Take the news; the keys that changed."""
@@ -64,6 +67,9 @@ class Page:
             del self.photos[node_id]
         self.photos |= dict(message.get("photos", ()))
         self.moments = message.get("moments", self.moments)
+        if "surface" in message:
+            self.surface = message["surface"]
+            self.gone.append(self.surface["gone"])
         self.head = message.get("head", self.head)
         self.camera = message.get("camera", self.camera)
         if "path" in message:
@@ -235,6 +241,46 @@ def test_an_object_that_cannot_be_shown_is_left_out_and_the_others_are_not(caplo
     state.reset(make_graph([node(1)], sequence=2))
     page.look()
     assert set(page.nodes) == {1}
+
+
+def grid_of(depth_m):
+    camera = Intrinsics(480.0, 480.0, 320.0, 240.0, 640, 480)
+    return DepthGrid(np.full((60, 80), round(1000 * depth_m), np.uint16), 8, camera)
+
+
+def test_the_room_is_sent_once_and_what_went_is_told():
+    state = LiveState()
+    page, nothing = Page(state), (np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4)))
+    rgb = np.full((480, 640, 3), (200, 10, 10), np.uint8)
+
+    def look(stamp_ns, x, depth_m):
+        T = np.eye(4)
+        T[0, 3] = x
+        local = local_graph(stamp_ns, *nothing, depth_grid=grid_of(depth_m), T_world_camera=T)
+        state.look(CameraView(stamp_ns, T, rgb, local=local))
+        page.look()
+        return page.surface
+
+    first = look(1, 0.0, 2.0)
+    assert first["from"] == 0 and not first["gone"]
+    steps = np.frombuffer(base64.b64decode(first["steps"]), "<i2").reshape(-1, 3)
+    places = np.array(first["origin"]) + first["step"] * steps
+    assert len(places) == 60 * 80 and np.allclose(places[:, 2], 2.0, atol=0.002)
+    colours = np.frombuffer(base64.b64decode(first["rgb"]), np.uint8).reshape(-1, 3)
+    assert (colours == (200, 10, 10)).all()
+    page.surface = None
+    assert look(2, 0.01, 2.0) is None  # like the first view
+    more = look(3, 0.5, 2.0)
+    assert more["from"] == 4800 and 0 < len(base64.b64decode(more["rgb"])) < 3 * 4800
+    for number in range(4):  # the wall is taken away
+        far = look(4 + number, 1.0 + 0.3 * number, 6.0)
+    assert far["from"] > 4800 and sum(map(len, page.gone)) > 1000
+    late = Page(state)
+    late.look()
+    assert late.surface["from"] == 0 and sorted(late.surface["gone"]) == sorted(sum(page.gone, []))
+    state.reset(make_graph([], session="another"))
+    page.look()
+    assert page.surface == {"from": 0, "gone": []}
 
 
 def test_a_relation_is_explained():
