@@ -61,7 +61,8 @@ def turned_back(
     for _ in range(turns % 4):
         boxes = _turned_back_once(boxes, height)
         width, height = height, width
-    return replace(frame_graph, boxes_xyxy=boxes, width=width, height=height), instances
+    turned = replace(frame_graph, boxes_xyxy=boxes, width=width, height=height, rgb_grid=None)
+    return turned, instances
 
 
 def _turned_back_once(boxes_xyxy: Float64, height: int) -> Float64:
@@ -482,7 +483,8 @@ class Perception:
         """
         found = self._perceive(seen.upright, detect)
         graph, instances = turned_back(found.frame_graph, found.instances, seen.turns)
-        graph = replace(graph, rgb_grid=np.ascontiguousarray(seen.original.rgb[GRID, GRID]))
+        if graph is not found.frame_graph:  # its samples are of other pixels
+            graph = replace(graph, rgb_grid=np.ascontiguousarray(seen.original.rgb[GRID, GRID]))
         return replace(found, frame_graph=graph, instances=instances, turns=seen.turns)
 
     def _perceive(self, frame: RgbdFrame, detect: Callable[[], Detections]) -> Perceived:
@@ -534,6 +536,7 @@ class Perception:
             relations=relations,
             colours_lab=mean_colours(frame.rgb, instances, [mask.window for mask in masks]),
             embeddings=embeddings,
+            rgb_grid=np.ascontiguousarray(frame.rgb[GRID, GRID]),
         )
         return Perceived(frame_graph, instances, dict(drops), self._failures)
 
