@@ -136,6 +136,13 @@ def test_the_room_is_drawn_and_steps_back_behind_a_chosen_object(chromium, tmp_p
         assert red.mean() > 0.03
         shown.evaluate("camera.position.set(0, 5, 0.2), controls.update(), draw()")
         assert (np.abs(pixels(shown) - (180, 20, 20)).max(axis=2) < 40).mean() < 0.01  # from behind
+        rows = shown.evaluate("layers.room.geometry.attributes.position.count")
+        shown.evaluate(
+            "addToRoom({ from: rows, gone: [0, 7], steps: '' }), draw('room')".replace(
+                "rows", str(rows)
+            )
+        )
+        until(shown, f"layers.room.geometry.attributes.position.count === {rows - 2}", "fewer")
         shown.evaluate("choose(1)")
         until(shown, "layers.room.material.opacity < 0.5", "it steps back")
         shown.locator("#switches label", has_text="room").click()

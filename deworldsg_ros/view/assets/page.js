@@ -82,7 +82,7 @@ for (const layer of Object.values(layers)) {
 
 // The room: points of the surfaces that the camera saw, in their colours.
 const room = { places: new Float32Array(0), colours: new Float32Array(0), sides: new Int8Array(0),
-  cell: 0.02 };
+  gone: new Set(), cell: 0.02 };
 let hasChosenPoints = false;  // else those of the room take the place of those of the objects
 layers.room = new THREE.Points(empty(), new THREE.PointsMaterial(
   { vertexColors: true, transparent: true, size: 0.03 }));
@@ -115,16 +115,19 @@ function addToRoom({ from = 0, gone = [], origin, step, cell, steps, rgb, sides:
   for (let at = 0; at < bytes.length; at += 3)
     linear.setRGB(bytes[at] / 255, bytes[at + 1] / 255, bytes[at + 2] / 255, "srgb")
       .toArray(colours, start + at);
-  for (const row of gone) places.fill(NaN, 3 * row, 3 * row + 3);
+  if (from === 0) room.gone.clear();
+  for (const row of gone) room.gone.add(row);
   Object.assign(room, { places, colours, sides, cell: cell ?? room.cell });
 }
 
 function drawRoom() {
+  const isKept = (_, at) => !room.gone.has(Math.floor(at / 3));
+  const kept = values => room.gone.size ? values.filter(isKept) : values;
+  const sides = Float32Array.from(kept(room.sides), value => value / 127);
   const shape = new THREE.BufferGeometry();
-  shape.setAttribute("position", new THREE.Float32BufferAttribute(room.places, 3));
-  shape.setAttribute("color", new THREE.Float32BufferAttribute(room.colours, 3));
-  shape.setAttribute("side", new THREE.Float32BufferAttribute(
-    Float32Array.from(room.sides, value => value / 127), 3));
+  shape.setAttribute("position", new THREE.Float32BufferAttribute(kept(room.places), 3));
+  shape.setAttribute("color", new THREE.Float32BufferAttribute(kept(room.colours), 3));
+  shape.setAttribute("side", new THREE.Float32BufferAttribute(sides, 3));
   layers.room.material.size = 1.4 * room.cell;
   layers.room.geometry.dispose();
   layers.room.geometry = shape;
