@@ -333,7 +333,6 @@ class Rivals:
         self, node: StageNode, session: Callable[[], str], tell: Callable[[], None]
     ) -> None:
         self._node, self._session, self._tell = node, session, tell
-        self._several_s = -math.inf
         self._topic = node.resolve_topic_name(UPDATES_TOPIC)
         self._subscription: Any = None
         self._heard_s = -math.inf
@@ -341,9 +340,7 @@ class Rivals:
     def problems(self) -> list[str]:
         """That there is one, in words. Call it about once a second, in the executor's thread."""
         several = self._node.count_publishers(self._topic) > 1
-        now_s = time.monotonic()
-        self._several_s = now_s if several else self._several_s
-        if now_s - max(self._several_s, self._heard_s) < RIVAL_SILENT_S:
+        if time.monotonic() - self._heard_s < RIVAL_SILENT_S:
             self._tell()
         if several and self._subscription is None:
             listen = self._node.guarded(self._hear)
@@ -423,7 +420,7 @@ class GraphKeeper:
         self._times = UpdateTimes(self._node.parameters.output.rate_hz)
         self._running_s = 0.0  # when the job that runs now was submitted
         self._publish_update = node.json_publisher(UPDATES_TOPIC, 50)
-        self._rivals = Rivals(node, lambda: self._session, lambda: self.submit(self._whole.changed))
+        self._rivals = Rivals(node, lambda: self._session, lambda: self.submit(self._tell_again))
         self._whole = WholeGraph(node, markers)
         self._embeddings = EmbeddingTopic(node)
         self.files = GraphFiles(node)
@@ -593,6 +590,10 @@ class GraphKeeper:
         self._whole.changed()
         self.files.changed()
         self._on_update(update, time.monotonic() - changed_s)
+
+    def _tell_again(self) -> None:
+        if self._builder is not None:
+            self._whole.changed()
 
     def _publish_whole(self) -> None:
         assert self._builder is not None

@@ -34,7 +34,7 @@ from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, RelationEvid
 from deworldsg_ros.streams.detections import sent_detections
 from deworldsg_ros.view import picture
 from deworldsg_ros.view.colours import view_axes
-from deworldsg_ros.view.live.state import LiveState
+from deworldsg_ros.view.live.state import LiveState, PageView
 from deworldsg_ros.view.markers import markers
 from deworldsg_ros.view.page import content_of
 from deworldsg_ros.wire import codec
@@ -213,7 +213,7 @@ def _use_hostile_graph(rng: np.random.Generator, folder: Path) -> None:
     _combine(message)
     state = LiveState()
     state.reset(message)
-    state.draw()
+    state.news(PageView(), 0.0)
     json.dumps(content_of(message, view_axes((0.0, 0.0, 1.0)), None), allow_nan=False)
     markers(message)
     graph = SceneGraph(message)

@@ -63,7 +63,7 @@ def test_what_changes_is_drawn_and_a_choice_stays(chromium):
         card.get_by_text("holds with 80%").wait_for()
         assert viewer.apply(*updates_of([cup_and_table(2), make_graph([], sequence=3)]))
         has(page, 0)
-        assert page.locator("#empty").inner_text().endswith("the camera is covered")
+        page.locator("#empty", has_text="the camera is covered").wait_for()
 
 
 def test_time_goes_back_for_one_page_and_not_for_another(chromium):
