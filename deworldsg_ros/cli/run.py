@@ -75,6 +75,11 @@ from deworldsg_ros.wire import messages as wire
 # Clips that the world model lost.
 FAILURES = ("world_model_error", "nan_features")
 LOADING = "loading the models …"
+# Files of bags and data sets by their ends; results, too, may be in the folder of a recording.
+INPUTS = (
+    *(".mcap", ".db3", "metadata.yaml", ".pose.txt"),
+    *("rgb.txt", "depth.txt", "groundtruth.txt", "associations.txt"),
+)
 
 
 @dataclass(frozen=True)
@@ -176,9 +181,12 @@ def _check_paths(options: RunOptions) -> None:
         files.append(("the trajectory", options.trajectory_out))
     check_paths(options.map_path, files)
     source = options.recording.resolve()
-    written = [*files, *([("the map", options.map_path)] if options.map_path is not None else [])]
-    for what, path in written:
-        if path.exists() and (path.resolve() == source or source in path.resolve().parents):
+    if options.map_path is not None:
+        files.append(("the map", options.map_path))
+    for what, path in files:
+        found = path.resolve()
+        is_input = source in found.parents and path.name.endswith(INPUTS)
+        if path.exists() and (found == source or is_input):
             raise ConfigurationError(f"{what} would replace {path}, which is of the recording")
 
 

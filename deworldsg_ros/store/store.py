@@ -37,8 +37,7 @@ from deworldsg_ros.wire import messages as wire
 GraphMessage = wire.SceneGraphMessage | wire.SceneGraphUpdateMessage
 # Of the end of the file that are searched at a time for the end of a line.
 _BLOCK = 1 << 20
-# How a line begins, and that of an update.
-_BEGIN = b'{"schema":'
+# How the line of an update begins.
 _UPDATE = b'{"schema":' + msgspec.json.encode(wire.schema_of(wire.SceneGraphUpdateMessage))[:-1]
 _UPDATE = _UPDATE.partition(b',"version"')[0]
 
@@ -64,8 +63,8 @@ class Journal:
     def _mend(self, path: Path, end: int) -> None:
         """Complete the last line, or drop it if a killed writer cut it off."""
         with path.open("rb") as file:
-            if file.read(len(_BEGIN)) != _BEGIN:
-                raise StoreError(f"{path} has no messages of a store: expected {_BEGIN.decode()}…")
+            if not file.read(64).lstrip().startswith(b"{"):
+                raise StoreError(f"{path} has no messages of a store: expected JSON, one a line")
             file.seek(end)
             last = file.read()
         try:

@@ -384,6 +384,26 @@ def test_a_last_line_without_its_end_is_kept_and_a_cut_file_is_named(tmp_path):
     assert notes.read_text() == "mine" and len(content(store)[0]) == 2
 
 
+@pytest.mark.parametrize("torn", [b"{", b'{"sch', b'{"schema":{"name":"scene_gr'])
+def test_a_first_line_that_was_cut_off_is_dropped(tmp_path, torn):
+    (tmp_path / MESSAGES_FILE).write_bytes(torn)
+    with StoreWriter(tmp_path) as writer:
+        assert writer.add(graph(1, 10.0, [node(1)]))
+    assert len(content(Store(tmp_path))[0]) == 1
+
+
+def test_messages_with_other_spaces_are_those_of_a_store(tmp_path):
+    file = tmp_path / "graph.json"
+    file.write_text(json.dumps(json.loads(wire.encode(graph(1, 10.0, [node(1)]))), indent=2))
+    with StoreWriter(tmp_path / "store") as writer:
+        writer.add_file(file)
+    messages = tmp_path / "store" / MESSAGES_FILE
+    whole = messages.read_bytes()
+    messages.write_bytes(whole + b'{"sch')
+    with StoreWriter(tmp_path / "store"):
+        assert messages.read_bytes() == whole
+
+
 def test_a_file_of_others_is_not_emptied(tmp_path):
     (tmp_path / MESSAGES_FILE).write_text("my diary")
     with pytest.raises(StoreError, match="no messages"), StoreWriter(tmp_path):
