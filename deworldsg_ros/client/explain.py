@@ -24,8 +24,6 @@ from deworldsg_ros.client.objects import HiddenObject, Point, Relation, SceneObj
 from deworldsg_ros.graph.messages import ABSENT
 from deworldsg_ros.graph.pairs import Between, contradicted
 from deworldsg_ros.graph.provenance import SeenFrames, SeenSpace
-from deworldsg_ros.scene.errors import ClientError
-from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M
 from deworldsg_ros.scene.vocabulary import CARRY_ON_TOP, PREDICATES, plain
 
 # Two boxes are in contact below this gap: the error of a measured extent.
@@ -223,8 +221,6 @@ def place_of(text: str, up: Point) -> Place | None:
     label, *numbers, within, unit = match.groups()
     within_m = float(within or 1.0) * (0.01 if unit == "cm" else 1.0)
     values = [float(number) for number in numbers if number is not None]
-    if not max(map(abs, values)) <= MAX_GRAPH_COORDINATE_M:
-        raise ClientError(f"'{text[:80]}': expected a place within {MAX_GRAPH_COORDINATE_M:g} m")
     if len(values) == 2:
         values.insert(int(np.argmax(np.abs(up))), 0.0)
     return Place(label, (values[0], values[1], values[2]), numbers[2] is None, within_m)

@@ -10,6 +10,7 @@ from support.recordings import camera_items, write_bag, write_seven_scenes
 
 import deworldsg_ros
 from deworldsg_ros.cli.configuration import described_yaml, effective_config
+from deworldsg_ros.cli.run import RunOptions, _check_paths
 from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.recordings.recording import open_recording
 
@@ -91,6 +92,30 @@ def test_convert_makes_a_bag_that_info_and_run_understand(folder):
     ):
         assert re.search(line, shown), shown
     assert "exists already" in refusal("convert", "auto", "kitchen", "kitchen.mcap")
+
+
+def test_no_output_replaces_what_the_recording_has(folder):
+    write_seven_scenes(folder / "kitchen", 5)
+    pose = folder / "kitchen" / "frame-000000.pose.txt"
+    before = pose.read_bytes()
+    words = ("run", "kitchen", "--rate", 5, "--out", "kitchen/out")
+    assert "of the recording" in refusal(*words, "--save-trajectory", pose)
+    assert pose.read_bytes() == before
+    printed("convert", "auto", "kitchen", "kitchen.mcap", "--rate", 5)
+    words = ("run", "kitchen.mcap", "--out", "out", "--save-trajectory", "kitchen.mcap")
+    assert "of the recording" in refusal(*words)
+    for rate in ("inf", "1e308", "1e-300"):
+        assert "rate is" in refusal("convert", "auto", "kitchen", "other.mcap", "--rate", rate)
+
+
+def test_results_may_lie_in_the_folder_of_the_recording(folder):
+    (folder / "kitchen" / "out").mkdir(parents=True)
+    (folder / "kitchen" / "out" / "scene_graph.json").write_text("{}")
+    (folder / "kitchen" / "room.map").write_text("")
+    (folder / "kitchen" / "way.txt").write_text("")
+    kitchen = Path("kitchen")
+    _check_paths(RunOptions(kitchen, kitchen / "out", trajectory_out=kitchen / "way.txt",
+                            map_path=kitchen / "room.map"))  # fmt: skip
 
 
 def test_info_of_recordings_that_lack_something(folder):

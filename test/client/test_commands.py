@@ -2,6 +2,7 @@
 
 import json
 import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +119,27 @@ def test_an_edit_of_a_map_gives_no_id_that_was_published(tmp_path):
     assert answer["nodes"] == [70, 71]
 
 
+def test_a_pair_is_explained_by_names_or_a_relation(demo_out):
+    texts = {
+        printed("explain", demo_out, *words)
+        for words in (("cup", "on", "table"), ("cup on table",), ("cup", "dining table"))
+    }
+    (text,) = texts
+    assert re.match(r"cup #\d+ is on dining table #\d+", text)
+    assert printed("explain", demo_out, "dining", "table").startswith("dining table #")
+    start_s = time.monotonic()
+    refusal("explain", demo_out, "a" + 60_000 * " " + "b")
+    assert time.monotonic() - start_s < 20.0
+
+
+def test_a_merge_never_replaces_what_it_reads(demo_out):
+    before = (demo_out / "scene_graph.json").read_bytes()
+    file = demo_out / "scene_graph.json"
+    assert "one of the graphs" in refusal("merge", demo_out, demo_out, file)
+    assert "360 degrees" in refusal("merge", demo_out, demo_out, "x", "--transform", "0,0,0,1e308")
+    assert file.read_bytes() == before
+
+
 def test_a_refused_edit_leaves_the_map_as_it_is(tmp_path):
     path = saved_map(tmp_path, Config())
     before = path.read_bytes()
@@ -129,6 +151,7 @@ def test_a_refused_edit_leaves_the_map_as_it_is(tmp_path):
         (["merge", "1", "²"], "² is no id"),
         (["delete", "9" * 5000], "is no id"),
         (["split", "1", "0,0", "1,1,1"], "length >= 3"),
+        (["set_label", "1", "a" * 257], "length <= 256"),
         (["delete", "-3"], "No such option"),
     ):
         assert says in refusal("edit", path, *words)

@@ -313,6 +313,18 @@ def test_endless_names_are_refused_at_once(text):
     assert time.monotonic() - started_s < 5.0  # seconds of a busy machine; it was minutes
 
 
+@pytest.mark.parametrize(
+    "question",
+    [
+        "cup not", "cup near (1e999, 0, 0)", "chair closest to (1e200, 0, 0)",
+        "cup within 1e999 m of table", "what changed since 1e300",
+    ],
+)  # fmt: skip
+def test_what_has_no_end_or_no_limit_is_refused(question):
+    with pytest.raises(ClientError):
+        ask(chairs(3), question)
+
+
 def test_too_many_conditions_are_refused():
     with pytest.raises(ClientError, match="9 conditions: expected at most 8"):
         parse("cup" + "".join(f" and within {i} m of table" for i in range(1, 10)))

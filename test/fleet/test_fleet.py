@@ -2,7 +2,7 @@
 
 import numpy as np
 from msgspec.structs import replace
-from support.view import SAVED, make_graph, make_node
+from support.view import SAVED, box_at, make_graph, make_node
 
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.client.combine import moved_object
@@ -65,6 +65,21 @@ def test_one_robot_with_an_impossible_graph_stops_no_other():
     assert len(fleet.combine().nodes) == len(ROOM)
     assert fleet.members["eve"].T_fleet_world is not None
     assert "orientation" in fleet.members["bob"].reason
+
+
+def test_robots_far_away_or_without_classes_stop_no_other():
+    far = seen_by("bob")
+    far.nodes.append(make_node(999, "cup", (1e8, 1e8, 1e8), box=box_at((0, 0, 0))))
+    nothing = [replace(node, classes=[], remainder=1.0) for node in seen_by("eve").nodes]
+    fleet = fleet_of(ada=ALL)
+    fleet.update("bob", far)
+    fleet.update("eve", replace(seen_by("eve"), nodes=nothing))
+    for sequence in (2, 3):
+        whole = fleet.combine()
+        assert len(whole.nodes) >= len(ROOM)
+        wire.decode(wire.encode(whole), wire.SceneGraphMessage)
+        fleet.update("ada", seen_by("ada", sequence=sequence))
+    assert "at most 1e+08 m" in fleet.members["bob"].reason
 
 
 def test_three_robots_in_unknown_worlds_have_one_node_an_object():

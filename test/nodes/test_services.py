@@ -12,9 +12,11 @@ import typer.testing
 import yaml
 from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import PoseStamped
+from msgspec.structs import replace
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.nodes_bench import LIMIT_S, Bench
+from support.reference_updates import diff
 from support.surfaces import CUP, HERE, TABLE, slab, view
 
 from deworldsg_ros.cli.app import app
@@ -31,7 +33,9 @@ from deworldsg_ros.ros.graph_services import BUSY
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.codec import local_graph_to_message
+from deworldsg_ros.wire.follow import empty_scene_graph
 
 FLOOR = slab((0, 0, 0.95), (1.2, 0.8, 0.01))
 OBJECTS = ((HERE, CUP), (FLOOR, TABLE))
@@ -252,6 +256,7 @@ def test_frames_do_not_wait_for_questions_and_further_ones_are_told_that_it_is_b
     waiting = graph_services.MOST_WAITING
     robot.expect(lambda: sum(call.done() for call in calls) == 40 - waiting, "the refusals")
     assert all(call.result().message == BUSY for call in calls if call.done())
+    assert robot.node.health.drops["busy"] == 40 - waiting
     go_on.set()
     robot.expect(lambda: all(call.done() for call in calls), "the answers")
     assert sum(call.result().success for call in calls) == waiting
@@ -330,6 +335,21 @@ def test_another_node_on_the_topic_is_noticed(robot):
         f"another node publishes a graph on /{topic}: end one of the two, or give it a namespace"
     ]
     assert robot.node.health.drops["other_session"]
+
+
+def test_clients_that_followed_another_node_come_back(robot, client):
+    robot.see(5)
+    robot.expect(lambda: client.has_graph and len(client.graph), "the graph")
+    before, session = len(client.graph), client.session
+    topic = "scene_graph/updates"
+    publisher = robot.peer.node.create_publisher(String, topic, reliable(10))
+    robot.expect(lambda: publisher.get_subscription_count() >= 2, "the node and the client")
+    empty = empty_scene_graph("world")
+    update = replace(diff(empty, replace(empty, sequence=1)), session="another")
+    publisher.publish(String(data=wire.encode(update)))
+    robot.expect(lambda: client.session == "another", "the other session")
+    # No frame comes: graph_node tells its graph by itself.
+    robot.expect(lambda: client.session == session and len(client.graph) == before, "the graph")
 
 
 def test_the_calls_in_the_documentation_work(robot, root_dir):
