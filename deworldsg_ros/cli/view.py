@@ -75,7 +75,6 @@ def view_graph(options: ViewOptions, console: Console) -> None:
     if options.path is None:
         _become_viewer_node(options)
         return
-    from deworldsg_ros.view.live.server import Viewer
     from deworldsg_ros.view.live.sources import is_graph, open_sink
 
     graph = read_graph(options.path) if is_graph(options.path) else None
@@ -86,7 +85,7 @@ def view_graph(options: ViewOptions, console: Console) -> None:
         if graph is not None:
             viewer.reset(graph)
             space = read_space(graph_path(options.path))
-            if isinstance(viewer, Viewer) and space is not None:
+            if space is not None:
                 viewer.see(space)
         else:
             _show_recording(viewer, options, console)

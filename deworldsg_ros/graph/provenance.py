@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from deworldsg_ros.base.array_file import read_arrays, write_arrays
 from deworldsg_ros.base.files import parse_json, read_regular, write_atomically
 from deworldsg_ros.graph.graph import GlobalGraph
-from deworldsg_ros.scene.arrays import Bool, Float64, Int64, UInt8, UInt16
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.checks import checked, holds, within
 from deworldsg_ros.scene.frame_graph import LocalGraph
@@ -37,6 +37,8 @@ NEAR_M, NEAR_FRACTION = 0.08, 0.03
 # Depth cameras measure nothing nearer than this.
 MIN_DEPTH_M = 0.1
 
+# Depth image (h, w), colours (h, w, 3), camera (4,) and T_world_camera (4, 4).
+View = tuple[UInt16, UInt8, Float64, Float64]
 _NAMES = ("view_depths_mm", "view_poses", "view_cameras", "view_stamps_ns")
 _COLOURS = "view_colours"  # not in files of older releases
 # Of a view without colours.
@@ -64,11 +66,11 @@ class SeenSpace:
     def __len__(self) -> int:
         return len(self.poses)
 
-    def note(self, local: LocalGraph) -> None:
-        """Keep the depth grid of a frame, if no view so far is like it."""
+    def note(self, local: LocalGraph) -> bool:
+        """Keep the depth grid of a frame, if no view so far is like it; returns whether it did."""
         grid, pose = local.depth_grid, local.T_world_camera
         if grid is None or self._has(pose):
-            return
+            return False
         if grid.depth_mm.shape != self.depths_mm.shape[1:]:  # of another camera
             self.__init__()  # type: ignore[misc]
             self.depths_mm = self.depths_mm.reshape(0, *grid.depth_mm.shape)
@@ -83,6 +85,7 @@ class SeenSpace:
         grey = np.full((*grid.depth_mm.shape, 3), GREY, np.uint8)
         rgb = grey if grid.rgb is None else grid.rgb
         self.colours = np.concatenate([self.colours[kept], rgb[None]])
+        return True
 
     def look(self, points_world: Float64) -> tuple[Bool, Bool]:
         """Whether each point (n, 3) was seen as free, and as occupied; neither = not seen.
@@ -91,22 +94,15 @@ class SeenSpace:
         """
         free = np.zeros(len(points_world), np.int64)
         occupied = np.zeros(len(points_world), np.int64)
-        for depth_mm, pose, (fx, fy, cx, cy) in zip(self.depths_mm, self.poses, self.cameras):
-            T = invert_pose(pose)
-            x, y, z = (points_world @ T[:3, :3].T + T[:3, 3]).T
-            ahead = np.maximum(z, MIN_DEPTH_M)
-            columns = np.floor(fx * x / ahead + cx)
-            rows = np.floor(fy * y / ahead + cy)
-            height, width = depth_mm.shape
-            seen = (z > MIN_DEPTH_M) & (columns >= 0) & (columns < width)
-            seen &= (rows >= 0) & (rows < height)
-            at = np.flatnonzero(seen)
-            measured = 0.001 * depth_mm[rows[at].astype(int), columns[at].astype(int)]
-            behind = measured - z[at]
-            near = NEAR_M + NEAR_FRACTION * z[at]
-            free[at] += (measured > 0) & (behind > near)
-            occupied[at] += (measured > 0) & (np.abs(behind) <= near)
+        for depth_mm, _, camera, pose in self.views():
+            at, is_free, is_occupied = seen_in(points_world, depth_mm, camera, pose)
+            free[at] += is_free
+            occupied[at] += is_occupied
         return free > occupied, (occupied > 0) & (occupied >= free)
+
+    def views(self) -> Iterator[View]:
+        """The images of each view and where it was, the oldest first."""
+        return zip(self.depths_mm, self.colours, self.cameras, self.poses)
 
     def move(self, T_correction: Float64, since_ns: int) -> None:
         """Apply a pose-graph correction (4, 4) to the views since a stamp."""
@@ -144,6 +140,35 @@ class SeenSpace:
         traces = self.poses[:, :3, :3].reshape(-1, 9) @ pose[:3, :3].ravel()
         steps_m = self.poses[traces >= LEAST_TRACE, :3, 3] - pose[:3, 3]
         return bool(((steps_m**2).sum(axis=1) < MOVED_M**2).any())
+
+
+def seen_in(
+    points_world: Float32 | Float64, depth_mm: UInt16, camera: Float64, T_world_camera: Float64
+) -> tuple[Int64, Bool, Bool]:
+    """What a view tells about points (n, 3).
+
+    Args:
+        points_world: metres.
+        depth_mm: (h, w) uint16, 0 = invalid.
+        camera: (4,) fx, fy, cx, cy in pixels of this image.
+        T_world_camera: (4, 4).
+
+    Returns:
+        The rows (m,) of the points inside the image; whether each was seen as free, because the
+        image shows something behind it, and as occupied.
+    """
+    fx, fy, cx, cy = camera
+    T = invert_pose(T_world_camera)
+    x, y, z = (points_world @ T[:3, :3].T + T[:3, 3]).T
+    ahead = np.maximum(z, MIN_DEPTH_M)
+    columns, rows = np.floor(fx * x / ahead + cx), np.floor(fy * y / ahead + cy)
+    height, width = depth_mm.shape
+    inside = (z > MIN_DEPTH_M) & (columns >= 0) & (columns < width)
+    inside &= (rows >= 0) & (rows < height)
+    at = np.flatnonzero(inside)
+    measured = 0.001 * depth_mm[rows[at].astype(int), columns[at].astype(int)]
+    behind, near = measured - z[at], NEAR_M + NEAR_FRACTION * z[at]
+    return at, (measured > 0) & (behind > near), (measured > 0) & (np.abs(behind) <= near)
 
 
 def space_path(graph_path: Path) -> Path:

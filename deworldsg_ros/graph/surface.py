@@ -7,23 +7,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from deworldsg_ros.graph.provenance import MIN_DEPTH_M, NEAR_FRACTION, NEAR_M, SeenSpace
+from deworldsg_ros.graph.provenance import SeenSpace, seen_in
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt8, UInt16
-from deworldsg_ros.scene.camera import invert_pose
 
 # A cell has one point. Those of larger rooms are wider, by this factor once or more.
 CELL_M, WIDER = 0.02, 1.3
 MOST_POINTS = 150_000
-# A depth that fewer than so many of four neighbours share is that of an edge between two surfaces.
+# A pixel is left out if fewer than two of its four neighbours have about its depth: it lies on an
+# edge, between two surfaces.
 LEAST_ALIKE, ALIKE_M, ALIKE_FRACTION = 2, 0.03, 0.05
-# Views that see through a point outweigh those that saw it, of which so many count.
+# A point goes when as many views see through it as saw it. At most so many that saw it count.
 MOST_VOTES = 4
 # Bits of a coordinate of a cell, and the cell at the origin.
 _BITS, _MIDDLE = 21, 1 << 20
 
 
 class Surface:
-    """Points of a room (n of them, some of which later views saw through).
+    """The n points of a room. Points that later views saw through are marked as gone.
 
     Points are only added at the end: who has the first k of them needs the rest alone, and
     `gone`. When cells become wider, all begins anew.
@@ -104,19 +104,10 @@ class Surface:
 
     def _vote(self, depth_mm: UInt16, camera: Float64, T_world_camera: Float64) -> None:
         """Count for each point whether the view sees it, or through it."""
-        fx, fy, cx, cy = camera
-        T = invert_pose(T_world_camera).astype(np.float32)
-        x, y, z = (self.points @ T[:3, :3].T + T[:3, 3]).T
-        ahead = np.maximum(z, MIN_DEPTH_M)
-        columns, rows = np.floor(fx * x / ahead + cx), np.floor(fy * y / ahead + cy)
-        height, width = depth_mm.shape
-        seen = (z > MIN_DEPTH_M) & ~self.gone
-        seen &= (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-        at = np.flatnonzero(seen)
-        measured = 0.001 * depth_mm[rows[at].astype(int), columns[at].astype(int)]
-        behind, near = measured - z[at], NEAR_M + NEAR_FRACTION * z[at]
-        through = (measured > 0) & (behind > near)
-        votes = self._votes[at] - through + ((measured > 0) & (np.abs(behind) <= near))
+        left = np.flatnonzero(~self.gone)
+        inside, through, seen = seen_in(self.points[left], depth_mm, camera, T_world_camera)
+        at = left[inside]
+        votes = self._votes[at] - through + seen
         self._votes[at] = np.minimum(votes, MOST_VOTES)
         lost = at[votes <= 0]
         if len(lost):
@@ -140,7 +131,7 @@ def surface_of(space: SeenSpace | None, most_points: int = MOST_POINTS) -> Surfa
     """The surface that the views of a graph show, the oldest first."""
     surface = Surface(most_points)
     if space is not None:
-        for view in zip(space.depths_mm, space.colours, space.cameras, space.poses):
+        for view in space.views():
             surface.add(*view)
     return surface
 

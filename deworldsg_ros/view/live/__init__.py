@@ -1,5 +1,6 @@
 """The live viewer. Sources send updates and camera views to a `Viewer`.
 
-`camera` and `state` compute what a page is told, without a network; `server` tells it. `foxglove`
-sends the graph to Foxglove. `sources` reads files and recordings; viewer_node reads topics.
+`camera`, `history` and `state` decide what a page has to receive; they need no network. `server`
+sends it. `foxglove` sends the graph to Foxglove. `sources` reads files and recordings; viewer_node
+reads topics.
 """

@@ -18,6 +18,7 @@ from foxglove import channels, messages
 from deworldsg_ros.client.objects import SceneObject, scene_object
 from deworldsg_ros.graph.extent import horizontal_axes
 from deworldsg_ros.graph.pairs import Pair
+from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.view.colours import QUIET, class_colours, to_rgb
@@ -101,6 +102,9 @@ class FoxgloveServer(foxglove.ServerListener):
             if applied:
                 self._send({node.id for node in update.nodes}, update)
             return applied
+
+    def see(self, space: SeenSpace) -> None:
+        """Do nothing: Foxglove shows the graph and the camera."""
 
     def look(self, view: CameraView) -> None:
         """Send a frame of the camera: the image with its masks, and its pose."""

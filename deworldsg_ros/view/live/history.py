@@ -8,7 +8,7 @@ from typing import NamedTuple
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import GraphReplica
 
-# A moment is found by applying at most so many updates to a snapshot.
+# A block has a snapshot and at most so many updates. To make a moment, they are applied in turn.
 BLOCK = 100
 # The oldest moments are forgotten beyond so many bytes, packed: minutes of a busy room at 30 Hz,
 # hours of a quiet one.

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 from deworldsg_ros.graph.graph_files import GRAPH_FILE
+from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
@@ -26,6 +27,10 @@ class Sink(Copy, Protocol):
     """
 
     url: str
+
+    def see(self, space: SeenSpace) -> None:
+        """Show what the camera saw of the room of a saved graph."""
+        ...
 
     def look(self, view: CameraView) -> None:
         """Show a frame of the camera."""

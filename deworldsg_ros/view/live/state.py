@@ -23,7 +23,7 @@ from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.graph.surface import Surface
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8, UInt16
-from deworldsg_ros.scene.frame_graph import GRID, LocalGraph
+from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.vocabulary import verb_of
 from deworldsg_ros.view.colours import class_colours, predicate_colours, view_axes
 from deworldsg_ros.view.live.camera import BestViews, CameraView, Shot, Shots, jpeg, with_masks
@@ -96,15 +96,22 @@ def scene_of(recipe: Recipe, up: Point) -> Scene:
     items = {
         node_id: scene_object(node, replica.frame_id, up) for node_id, node in replica.nodes.items()
     }
-    nodes = {node_id: text for node_id, item in items.items() if (text := _node_json(item, axes))}
-    edges = {
-        pair: _json(edge_values(edge))
-        for pair, edge in replica.edges.items()
-        if pair[0] in nodes and pair[1] in nodes
-    }
+    nodes = {node_id: _node_json(item, axes) for node_id, item in items.items()}
+    edges = {pair: _json(edge_values(edge)) for pair, edge in replica.edges.items()}
+    return _scene(replica, items, nodes, edges)
+
+
+def _scene(
+    replica: GraphReplica,
+    items: Mapping[int, SceneObject],
+    nodes: Mapping[int, bytes],
+    edges: Mapping[Pair, bytes],
+) -> Scene:
+    """A graph with its values, without what cannot be shown."""
+    shown = {node_id: text for node_id, text in nodes.items() if text}
     return Scene(
-        nodes,
-        edges,
+        shown,
+        {pair: text for pair, text in edges.items() if pair[0] in shown and pair[1] in shown},
         tuple(dict.fromkeys(items[i].label for i in sorted(items))),
         tuple(dict.fromkeys(edge.predicate for edge in replica.edges.values())),
         replica.frame_id,
@@ -196,7 +203,7 @@ class LiveState:
     def look(self, view: CameraView) -> None:
         """Take a frame of the camera: its way, its image, photos and points of its objects."""
         self.crops.add(view)
-        self._newest()  # the colours
+        self._follow()  # the colours
         image = with_masks(view, self._colours)
         self._shots.add(
             Shot(
@@ -213,39 +220,16 @@ class LiveState:
         if len(self._places) > MOST_PLACES:
             self._places, self._redrawn = self._places[::2], self._redrawn + 1
         if view.local is not None:
-            if view.rgb is not None:
-                self._note(view.local, view.rgb)
+            if self._space.note(_with_colours(view.local, view.rgb)):
+                self._add(*list(self._space.views())[-1])
             for node_id, points in zip(view.node_ids, view.local.surface_points_world):
                 known = self._points.get(node_id, np.zeros((0, 3), np.float32))
                 self._points[node_id] = np.concatenate([known, points])[-POINTS_OF_OBJECT:]
 
     def see(self, space: SeenSpace) -> None:
         """Take the views of a saved graph: the surface of its room."""
-        for view in zip(space.depths_mm, space.colours, space.cameras, space.poses):
+        for view in space.views():
             self._add(*view)
-
-    def _note(self, local: LocalGraph, rgb: UInt8) -> None:
-        """Add the frame to the surface, if no view so far is like it."""
-        grid = local.depth_grid
-        if grid is None:
-            return
-        if grid.rgb is None and rgb.shape[:2] == (grid.intrinsics.height, grid.intrinsics.width):
-            grid = replace(grid, rgb=rgb[GRID, GRID])
-            local = replace(local, depth_grid=grid)
-        before = self._space.stamps_ns
-        self._space.note(local)
-        if self._space.stamps_ns is not before:
-            self._add(
-                *(
-                    part[-1]
-                    for part in (
-                        self._space.depths_mm,
-                        self._space.colours,
-                        self._space.cameras,
-                        self._space.poses,
-                    )
-                )
-            )
 
     def _add(self, depth_mm: UInt16, rgb: UInt8, camera: Float64, pose: Float64) -> None:
         begun, gone = self._surface.begun, self._surface.gone.copy()
@@ -279,15 +263,15 @@ class LiveState:
             page: what the page has; it is updated.
             now_s: of a clock that only goes on.
         """
-        scene = self._newest()
-        if page.moment is not None:
-            scene = self._scenes.get(page.moment, scene)
+        self._follow()
+        scene = self._scenes.get(page.moment) if page.moment is not None else None
+        scene = scene or self._newest()
         for node_id in page.nodes.keys() - scene.nodes.keys():  # the page forgets them, too
             page.clouds.pop(node_id, None)
             page.photos.pop(node_id, None)
         parts = [
-            *_changes("nodes", "removed", page.nodes, scene.nodes, lambda node_id: node_id),
-            *_changes("edges", "removedEdges", page.edges, scene.edges, list),
+            *_changes("nodes", "removed", page.nodes, scene.nodes),
+            *_changes("edges", "removedEdges", page.edges, scene.edges),
             *self._head_news(page, scene),
             *self._surface_news(page, now_s),
             *self._cloud_news(page, scene, now_s),
@@ -299,13 +283,13 @@ class LiveState:
     def why(self, subject: int, object_: int) -> list[str]:
         """Where the belief in a relation of the newest graph comes from; empty if it is gone."""
         edge = self.history.newest.edges.get((subject, object_))
-        self._newest()
+        self._follow()
         if edge is None or not {subject, object_} <= self._items.keys():
             return []
         return why(edge, self._items)
 
-    def _newest(self) -> Scene:
-        """The newest graph; only what changed is encoded again."""
+    def _follow(self) -> None:
+        """Encode what changed in the newest graph."""
         newest = self.history.newest
         if self._up != up_of(newest):  # every value is another
             self._scenes.clear()
@@ -334,19 +318,11 @@ class LiveState:
         if changed:
             colours = class_colours(self._items[i].label for i in sorted(self._items))
             self._colours = {i: colours[item.label] for i, item in self._items.items()}
-        nodes = {node_id: text for node_id, text in self._nodes.items() if text}
-        return Scene(
-            nodes,
-            {
-                pair: text
-                for pair, (_, text) in self._edges.items()
-                if pair[0] in nodes and pair[1] in nodes
-            },
-            tuple(dict.fromkeys(self._items[i].label for i in sorted(self._items))),
-            tuple(dict.fromkeys(edge.predicate for edge in newest.edges.values())),
-            newest.frame_id,
-            newest.stamp_ns,
-        )
+
+    def _newest(self) -> Scene:
+        """The newest graph, after `_follow`."""
+        edges = {pair: text for pair, (_, text) in self._edges.items()}
+        return _scene(self.history.newest, self._items, self._nodes, edges)
 
     def _begin_session(self) -> None:
         """Ids of another session are of other objects."""
@@ -412,8 +388,8 @@ class LiveState:
         stamps = self.crops.stamps()
         photos = {i: _json([i, stamps[i]]) for i in scene.nodes if i in stamps}
         return [
-            *_changes("clouds", "removedClouds", page.clouds, shown, lambda node_id: node_id),
-            *_changes("photos", "removedPhotos", page.photos, photos, lambda node_id: node_id),
+            *_changes("clouds", "removedClouds", page.clouds, shown),
+            *_changes("photos", "removedPhotos", page.photos, photos),
         ]
 
     def _encoded_clouds(self) -> dict[int, bytes]:
@@ -479,17 +455,27 @@ class LiveState:
         return [shot.image]
 
 
+def _with_colours(local: LocalGraph, rgb: UInt8 | None) -> LocalGraph:
+    """A local graph of a node of another release, with colours of the image."""
+    grid = local.depth_grid
+    if grid is None or grid.rgb is not None or rgb is None:
+        return local
+    if rgb.shape[:2] != (grid.intrinsics.height, grid.intrinsics.width):
+        return local
+    every = slice(grid.stride_px // 2, None, grid.stride_px)
+    return replace(local, depth_grid=replace(grid, rgb=rgb[every, every]))
+
+
 def _changes(
     name: str,
     removed: str,
     known: dict[Any, bytes],
     present: Mapping[Any, bytes],
-    key: Callable[[Any], Any],
 ) -> list[str]:
     """The values that a page lacks and those that are gone, as members of a JSON object."""
     new = [text for at, text in present.items() if known.get(at) != text]
-    gone = [key(at) for at in known if at not in present]
-    for at in [at for at in known if at not in present]:
+    gone = [at for at in known if at not in present]
+    for at in gone:
         del known[at]
     known.update(present)
     parts = [f'"{name}":{_list(new)}'] if new else []
