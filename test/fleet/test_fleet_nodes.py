@@ -79,6 +79,19 @@ def test_a_link_without_a_usable_name_is_refused_in_one_line(tmp_path, name):
     assert "Traceback" not in log
 
 
+def test_a_link_without_a_router_says_so_and_ends_at_once(tmp_path, endpoint):
+    link = {"robot": "ada", "connect": endpoint}
+    with NodeProcess("fleet_link_node", tmp_path, parameters=link) as node, peer() as test:
+        statuses = test.statuses()
+        node.wait_ready()
+        test.spin_until(
+            lambda: any(f"no answer of fleet_node over {endpoint}" in str(s) for s in statuses),
+            60.0,
+            "the missing router",
+        )
+        assert node.interrupt() == 0, node.log
+
+
 def test_robots_that_come_and_go_while_diagnostics_are_read(endpoint):
     with alone(FleetNode, {"listen": endpoint}) as node:
         node._loop.stop()

@@ -1,8 +1,7 @@
 // The parts of three.js that the page uses; tools/page/make.sh bundles them.
 export {
-  AmbientLight, BoxGeometry, BufferGeometry, Color, ConeGeometry, DirectionalLight, EdgesGeometry,
-  Float32BufferAttribute, GridHelper, Group, Line, LineBasicMaterial, LineSegments, Mesh,
-  MeshBasicMaterial, MeshLambertMaterial, PerspectiveCamera, Points, PointsMaterial,
-  QuadraticBezierCurve3, Quaternion, Raycaster, Scene, TubeGeometry, Vector2, Vector3, WebGLRenderer,
+  BufferGeometry, Color, Float32BufferAttribute, GridHelper, LineBasicMaterial, LineSegments, Mesh,
+  MeshBasicMaterial, PerspectiveCamera, Points, PointsMaterial, QuadraticBezierCurve3, Raycaster,
+  Scene, Vector2, Vector3, WebGLRenderer,
 } from "three";
 export { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
