@@ -94,6 +94,10 @@ def header(**values: Any) -> Callable[[Arrays], Arrays]:
 
 ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
     # Each of these ended the process, or hung it, before maps were checked.
+    **{
+        f"no {name}": lambda arrays, name=name: {k: v for k, v in arrays.items() if k != name}
+        for name in ("merging.records", "merging.blocks", "ids", "header")
+    },
     "blocks are shorter than their counts": changed("merging.blocks", lambda a: a[:-5]),
     "counts of 2^31": changed("merging.block_counts", put(0, 2**31)),
     "counts of 2^62, whose sum overflows to the right one": changed(

@@ -56,7 +56,7 @@ def parse_any_json(content: bytes) -> Any:
 
 
 def parse_yaml(content: bytes) -> Any:
-    """YAML as plain values; ValueError for other text, aliases, or more than 32 levels.
+    """YAML as plain values; ValueError for other text, aliases, double keys, more than 32 levels.
 
     ROS parameter files have no aliases either. A few lines of aliases may stand for gigabytes.
     """
@@ -64,6 +64,7 @@ def parse_yaml(content: bytes) -> Any:
         raise ValueError(f"YAML has {len(content)} bytes: expected at most {MAX_YAML_BYTES}")
     try:
         check_yaml(content)
+        _check_keys(yaml.compose(content, Loader=yaml.CSafeLoader))
         value = msgspec.yaml.decode(content)
         msgspec.json.encode(value)
     except Exception as error:  # PyYAML passes errors of the types that it builds on
@@ -81,6 +82,25 @@ def check_yaml(content: bytes) -> None:
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_YAML_DEPTH:
             raise ValueError(f"YAML has more than {MAX_YAML_DEPTH} levels")
+
+
+def _check_keys(node: yaml.Node | None) -> None:
+    """Raise ValueError for a key that stands twice: YAML's readers take the last one in silence."""
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _check_keys(item)
+    elif isinstance(node, yaml.MappingNode):
+        lines: dict[str, int] = {}
+        for key, value in node.value:
+            _check_keys(value)
+            if isinstance(key, yaml.ScalarNode):
+                line = key.start_mark.line + 1
+                if key.value in lines:
+                    raise ValueError(
+                        f"the key {key.value!r} is in line {lines[key.value]} and in line {line}: "
+                        "expected it once"
+                    )
+                lines[key.value] = line
 
 
 @contextmanager

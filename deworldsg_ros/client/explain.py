@@ -24,6 +24,7 @@ from deworldsg_ros.client.objects import HiddenObject, Point, Relation, SceneObj
 from deworldsg_ros.graph.messages import ABSENT
 from deworldsg_ros.graph.pairs import Between, contradicted
 from deworldsg_ros.graph.provenance import SeenFrames, SeenSpace
+from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.scene.vocabulary import CARRY_ON_TOP, PREDICATES, plain
 
 # Two boxes are in contact below this gap: the error of a measured extent.
@@ -206,6 +207,7 @@ _PLACE = re.compile(
     rf"(.+?)\s+near\s*\(\s*({_NUMBER})\s*,\s*({_NUMBER})\s*(?:,\s*({_NUMBER})\s*)?\)"
     r"(?:\s+within\s+([0-9]{0,9}\.?[0-9]{1,9})\s*(cm|m)?)?"
 )
+_PLACE_LIKE = re.compile(r"\bnear\s*\(")
 
 
 def place_of(text: str, up: Point) -> Place | None:
@@ -214,9 +216,17 @@ def place_of(text: str, up: Point) -> Place | None:
     Two numbers are the two horizontal coordinates, in the order of the axes; a third one, of the
     vertical axis, makes them a point. After them, ``within 50 cm`` is the largest distance; else it
     is 1 m.
+
+    Raises:
+        ClientError: for other numbers after ``near (``.
     """
     match = _PLACE.fullmatch(text.strip())
     if match is None:
+        if _PLACE_LIKE.search(text):
+            raise ClientError(
+                f"'{text[:80]}': expected a place such as 'chair near (1.6, -0.5)', in metres and "
+                "without exponents, and perhaps 'within 50 cm' after it"
+            )
         return None
     label, *numbers, within, unit = match.groups()
     within_m = float(within or 1.0) * (0.01 if unit == "cm" else 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -42,6 +43,7 @@ class GraphTools:
         self._newest = newest
         self._client = client
         self._known: deque[SceneGraph] = deque(maxlen=MOST_GRAPHS)
+        self._lock = threading.Lock()  # the server answers each question in a thread of its own
 
     def list_objects(
         self, label: str = "", min_probability: float = 0.0, limit: int = MOST_ANSWERS
@@ -137,8 +139,10 @@ class GraphTools:
             raise ClientError(f"seconds_ago {seconds_ago:g}: expected at most {MAX_SECONDS}")
         graph = self._graph()
         start_ns = graph.stamp_ns - round(seconds_ago * 1e9)
-        earlier = [known for known in self._known if known.stamp_ns <= start_ns]
-        before = earlier[-1] if earlier else self._known[0]
+        with self._lock:
+            known = list(self._known)
+        earlier = [item for item in known if item.stamp_ns <= start_ns]
+        before = earlier[-1] if earlier else known[0]
         answer: dict[str, Any] = {
             **_about(graph),
             "compared_with_s": before.stamp_ns / 1e9,
@@ -180,10 +184,11 @@ class GraphTools:
         return self._graph().goal_near(which, distance_m, robot=robot).to_dict()
 
     def _graph(self) -> SceneGraph:
-        graph = self._newest()
-        if not self._known or self._known[-1] is not graph:
-            self._known.append(graph)
-        return graph
+        with self._lock:
+            graph = self._newest()
+            if not self._known or self._known[-1] is not graph:
+                self._known.append(graph)
+            return graph
 
 
 class EditTools:
@@ -320,6 +325,8 @@ def make_server(newest: Callable[[], SceneGraph], client: Any = None, edits: boo
                 return function(*arguments, **named)
             except DeWorldSGError as error:
                 raise ToolError(str(error)) from error
+            except Exception as error:  # an agent would be told nothing but that it failed
+                raise ToolError(f"{function.__name__} failed: {error!r}") from error
 
         return call
 

@@ -32,6 +32,8 @@ MAX_ROBOTS = 256
 MAX_PACKED_BYTES, MAX_ANSWER_BYTES = 16 * 2**20, 64 * 2**20
 # Objects and relations of a robot's graph, however many answers it came in.
 MAX_PARTS = 200_000
+# A router is looked for so long, again and again: meanwhile signals and diagnostics are served.
+CONNECT_S = 1.0
 # A robot that has never answered keeps its place for so long, if another one needs it.
 PATIENCE_S = 10.0
 # A robot without a token and without an answer for so long is asked no more. If it comes back, its
@@ -43,16 +45,15 @@ class NoRouterError(ConfigurationError):
     """No router answers yet."""
 
 
-def open_session(connect: str = "", listen: str = "", wait_s: float | None = None) -> Any:
+def open_session(connect: str = "", listen: str = "") -> Any:
     """A Zenoh session. It does not search the network for other routers.
 
     Args:
         connect: endpoints of routers, e.g. ``tcp/10.0.0.5:7447``, separated by commas.
         listen: endpoints on which this process is a router itself; empty = it is none.
-        wait_s: how long a router that is not there yet is waited for; None = without end.
 
     Raises:
-        NoRouterError: if none has answered in this time.
+        NoRouterError: if no router has answered for `CONNECT_S`.
         ConfigurationError: without the package eclipse-zenoh, for an endpoint that cannot be read,
             or one that is in use.
     """
@@ -67,8 +68,7 @@ def open_session(connect: str = "", listen: str = "", wait_s: float | None = Non
         for key, value in {
             "mode": "router" if listen else "client",
             "connect/endpoints": _endpoints(connect),
-            # A router that is not there yet is waited for, deaf to signals, unless for a while.
-            "connect/timeout_ms": 0 if listen else -1 if wait_s is None else round(1000 * wait_s),
+            "connect/timeout_ms": 0 if listen else round(1000 * CONNECT_S),
             "connect/exit_on_failure": False,
             "listen/endpoints": _endpoints(listen),
             "scouting/multicast/enabled": False,
@@ -146,12 +146,14 @@ class Follower:
     Attributes:
         replica: the copy.
         received_bytes: size of all answers.
+        others: answers of further feeds with this key, which are left out.
     """
 
     def __init__(self, session: Any, key: str) -> None:
         self._session, self._key = session, key
         self.replica = GraphReplica()
-        self.received_bytes = 0
+        self.received_bytes = self.others = 0
+        self._feed = ""
 
     def ask(self, timeout_s: float) -> bool | None:
         """Ask once.
@@ -167,9 +169,7 @@ class Follower:
         if replica.session is not None:
             parameters += f";session={replica.session}"
         answered = None
-        for reply in self._session.get(f"{self._key}?{parameters}", timeout=timeout_s):
-            if reply.ok is None:
-                continue
+        for reply in self._own(parameters, timeout_s):
             size = len(reply.ok.payload)
             self.received_bytes += size
             if size > MAX_PACKED_BYTES:
@@ -189,6 +189,25 @@ class Follower:
                     f"{MAX_PARTS}",
                 )
         return answered
+
+    def _own(self, parameters: str, timeout_s: float) -> list[Any]:
+        """The answers of one feed: of the one that is followed, as long as it answers."""
+        import zenoh
+
+        replies = [
+            reply
+            for reply in self._session.get(
+                f"{self._key}?{parameters}",
+                timeout=timeout_s,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            )
+            if reply.ok is not None
+        ]
+        feeds = [str(reply.replier_id) for reply in replies]
+        if feeds and self._feed not in feeds:
+            self._feed = feeds[0]
+        self.others += len(set(feeds) - {self._feed})
+        return [reply for reply, feed in zip(replies, feeds) if feed == self._feed]
 
 
 # One answer at a time: the memory for it is taken once, however many robots there are.
@@ -274,6 +293,15 @@ class Robots:
             if name not in self.followers:
                 continue
             answers[name] = asking.changed
+            if self.followers[name].others:
+                self.followers[name].others = 0
+                self._errors.append(
+                    RefusedInput(
+                        "same_name",
+                        f"two robots are named '{name}': the first one is followed; expected "
+                        "another `robot` for each fleet_link_node",
+                    )
+                )
             if asking.changed is None:
                 self._silent.add(name)
             else:

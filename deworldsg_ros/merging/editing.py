@@ -317,6 +317,8 @@ class Editor:
         return self._split(graph, request, stamp_ns)
 
     def _set_label(self, graph: GlobalGraph, request: SetLabel, stamp_ns: int) -> EditReply:
+        if not request.label.strip():
+            raise refused(f"label {request.label!r} is blank: expected a name, e.g. 'cup'")
         try:
             check_labels([request.label])
         except ValueError as error:

@@ -22,9 +22,6 @@ from deworldsg_ros.ros.threads import Repeating
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.wire.follow import ChangeLog
 
-# A router is looked for so long, again and again: meanwhile signals and diagnostics are served.
-CONNECT_S = 1.0
-
 
 class _Link(NamedTuple):
     """The connection to the fleet."""
@@ -98,7 +95,7 @@ class FleetLinkNode(StageNode):
         """Look for a router; `waiting_for` says if there is none yet."""
         settings = self.parameters.node
         try:
-            session = open_session(connect=settings.connect, wait_s=CONNECT_S)
+            session = open_session(connect=settings.connect)
         except NoRouterError:
             return
         key = robot_key(settings.robot)

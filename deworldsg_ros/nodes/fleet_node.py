@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import sys
 import time
+from contextlib import suppress
 from typing import Any
 
 from deworldsg_ros.fleet.fleet import Fleet
-from deworldsg_ros.fleet.zenoh_link import Feed, Robots, open_session, part_key
+from deworldsg_ros.fleet.zenoh_link import Feed, NoRouterError, Robots, open_session, part_key
 from deworldsg_ros.ros.graph_output import GraphTopics
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import FleetParameters
@@ -30,26 +31,28 @@ class FleetNode(StageNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("fleet_node", "graphs of the fleet", **options)
-        settings = self.parameters.node
-        listen = "" if settings.connect else settings.listen
-        self._session = open_session(connect=settings.connect, listen=listen)
-        self._robots = Robots(self._session)
+        self._session: Any = None
+        self._robots: Robots | None = None
+        self._connect()
         self._fleet = Fleet()
         self._topics = GraphTopics(self, "fleet")
         self._publish_robots = self.text_publisher("fleet/robots", 1, latched=True)
         self._feeds: dict[str, Feed] = {}
         self._parts: dict[str, ChangeLog] = {}
         self._answered_s: dict[str, float] = {}
-        self._loop = Repeating(self, self._step, settings.period_s)
+        self._loop = Repeating(self, self._step, self.parameters.node.period_s)
 
     def close(self) -> None:
         """End the thread and the connections."""
         self._loop.stop()
-        self._session.close()
+        if self._session is not None:
+            self._session.close()
         super().close()
 
     def waiting_for(self, now_ns: int) -> list[str]:
         """Robots that do not answer, and those that are not located."""
+        if self._robots is None:
+            return [f"no router answers at {self.parameters.node.connect}"]
         now_s = time.monotonic()
         missing = [
             f"{name} has not answered for {now_s - last_s:.0f} s"
@@ -65,18 +68,32 @@ class FleetNode(StageNode):
 
     def more_values(self) -> dict[str, str]:
         """Robots and bytes on the wire."""
+        robots = self._robots
         return {
             "robots": str(len(self._answered_s)),
-            "bytes received": str(self._robots.received_bytes),
+            "bytes received": str(0 if robots is None else robots.received_bytes),
             "bytes sent": str(sum(feed.sent_bytes for feed in list(self._feeds.values()))),
         }
 
+    def _connect(self) -> None:
+        """Listen, or look for a router; `waiting_for` says if there is none yet."""
+        settings = self.parameters.node
+        listen = "" if settings.connect else settings.listen
+        with suppress(NoRouterError):
+            self._session = open_session(connect=settings.connect, listen=listen)
+            self._robots = Robots(self._session)
+
     def _step(self) -> None:
-        answers = self._robots.ask(self.parameters.node.period_s + 1.0)
-        for error in self._robots.take_errors():
+        if self._robots is None:
+            self._connect()
+        robots = self._robots
+        if robots is None:
+            return
+        answers = robots.ask(self.parameters.node.period_s + 1.0)
+        for error in robots.take_errors():
             with self.refusing():
                 raise error
-        for name in self._robots.take_forgotten():
+        for name in robots.take_forgotten():
             self._answered_s.pop(name, None)
             self._fleet.members.pop(name, None)
             self._parts.pop(name, None)
@@ -86,7 +103,7 @@ class FleetNode(StageNode):
             if changed is not None:
                 self._answered_s[name] = time.monotonic()
             if changed:
-                self._fleet.update(name, self._robots.followers[name].replica.message())
+                self._fleet.update(name, robots.followers[name].replica.message())
         if not any(answers.values()):
             return
         self._topics.publish(self._fleet.combine())

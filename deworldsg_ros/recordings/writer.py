@@ -60,6 +60,7 @@ def write_mcap(messages: Iterable[RawRoleMessage], path: Path) -> int:
                 raise RecordingError(
                     f"output {path}: the recording has no messages; expected at least one"
                 )
+            check_output(path)  # another one may have been written meanwhile
             (staged / "bag" / "bag.mcap").rename(staged / path.name)
             shutil.rmtree(staged / "bag")
     except OSError as error:

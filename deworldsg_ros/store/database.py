@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import fcntl
 import os
+import pickle
 import re
-import threading
+import resource
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -181,6 +184,8 @@ VERSION = 1
 BUFFER_BYTES = 1 << 30
 # A question that takes longer is ended, and so is one with more rows.
 QUESTION_LIMIT_S, MOST_ROWS = 60.0, 100_000
+# Memory of a question, beside that of the open database.
+QUESTION_BYTES = 2 << 30
 # More rows are loaded at once. That also joins the log with the database: a third of a second.
 MANY_ROWS = 1000
 # A writer has the database for some milliseconds every other second, and for seconds to rebuild it.
@@ -269,37 +274,22 @@ class Database:
                 return Rows(result.get_column_names(), result.get_all())
 
     def answer(self, question: str, parameters: Mapping[str, Any] | None = None) -> Rows:
-        """Answer a question within `QUESTION_LIMIT_S` and `MOST_ROWS`.
+        """Answer a question of at most `MOST_ROWS`.
 
         Raises:
-            StoreError: if it takes more, or cannot be answered.
+            StoreError: if it has more, or cannot be answered.
         """
-        end_s = time.monotonic() + QUESTION_LIMIT_S
-        too_long = f"the question cannot be answered: it takes more than {QUESTION_LIMIT_S:g} s"
-        # Ladybug's own limit is not looked at in all of its operators.
-        timer = threading.Timer(QUESTION_LIMIT_S, self._connection.interrupt)
-        timer.start()
         try:
             result = self._connection.execute(question, dict(parameters or {}))
             with closing(result):
                 if result.get_num_tuples() > MOST_ROWS:
-                    raise StoreError(
-                        "the question cannot be answered: it has "
-                        f"{result.get_num_tuples()} rows; expected at most {MOST_ROWS}, as with "
-                        "LIMIT"
+                    raise _refusal(
+                        f"it has {result.get_num_tuples()} rows; expected at most {MOST_ROWS}, as "
+                        "with LIMIT"
                     )
-                rows = []
-                while result.has_next():
-                    if time.monotonic() > end_s:
-                        raise StoreError(too_long)
-                    rows.append(result.get_next())
-                return Rows(result.get_column_names(), rows)
+                return Rows(result.get_column_names(), result.get_all())
         except _ERRORS as error:
-            if time.monotonic() > end_s:
-                raise StoreError(too_long) from error
             raise _refusal((str(error).strip() or repr(error)).splitlines()[0]) from error
-        finally:
-            timer.cancel()
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
@@ -476,6 +466,54 @@ def opened(path: Path, *, read_only: bool) -> Iterator[Database]:
             yield Database(connection)
         if not read_only:
             being_written.unlink()
+
+
+def answer_apart(path: Path, question: str, parameters: Mapping[str, Any]) -> Rows:
+    """Answer a question in a process of its own, within `QUESTION_LIMIT_S` and `QUESTION_BYTES`.
+
+    Ladybug looks at its own limits in some of its operators only, and nested questions end it.
+
+    Raises:
+        StoreError: if it takes more, or cannot be answered.
+    """
+    try:
+        asked = pickle.dumps((path, question, dict(parameters)))
+    except Exception as error:  # pickle raises any type
+        raise _refusal(f"a parameter is no plain value: {error}") from error
+    ask = f"from {__name__} import answer_asked; answer_asked()"
+    paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-c", ask],
+            input=asked,
+            capture_output=True,
+            timeout=QUESTION_LIMIT_S,
+            env={**os.environ, **paths},
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise _refusal(f"it takes more than {QUESTION_LIMIT_S:g} s") from error
+    if ended.returncode:
+        raise _refusal(f"the database ended ({ended.returncode}): ask something simpler")
+    answer = pickle.loads(ended.stdout)
+    if isinstance(answer, str):
+        raise StoreError(answer)
+    return Rows(*answer)
+
+
+def answer_asked() -> None:
+    """The other side of `answer_apart`."""
+    path, question, parameters = pickle.load(sys.stdin.buffer)
+    try:
+        with opened(path, read_only=True) as database:
+            pages = int(Path("/proc/self/statm").read_text().split()[0])
+            most = pages * resource.getpagesize() + QUESTION_BYTES
+            resource.setrlimit(resource.RLIMIT_AS, (most, most))
+            found = database.answer(question, parameters)
+        content = pickle.dumps((found.columns, found.rows))
+    except (StoreError, OSError, RuntimeError, MemoryError) as error:
+        content = pickle.dumps(str(error) or "the question cannot be answered: it takes too much")
+    sys.stdout.buffer.write(content)
 
 
 def stay_of(row: Sequence[Any]) -> Stay:

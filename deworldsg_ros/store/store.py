@@ -25,6 +25,7 @@ from deworldsg_ros.store.database import (
     History,
     Rows,
     Stay,
+    answer_apart,
     checked_question,
     opened,
     stay_of,
@@ -379,8 +380,8 @@ class Store:
             StoreError: if it cannot be answered.
         """
         question = checked_question(cypher)
-        with self.opened() as database:
-            return database.answer(question, parameters)
+        with self.opened():
+            return answer_apart(self._path, question, parameters or {})
 
     def at(self, time_ns: int, label: str | None = None) -> list[Stay]:
         """Where objects were at a time, by label and id.

@@ -100,6 +100,8 @@ def test_what_is_known_of_a_place(small):
     assert "a chair with 0%" in str(graph.explain("chair near (0, 0) within 20 cm"))
     assert known("chair near (-3, 0)", graph) == "object #9 may be it"
     assert "no class is probable enough" in str(graph.explain("chair near (-3, 0)"))
+    with pytest.raises(ClientError, match="without exponents"):
+        graph.explain("chair near (1e999, 0)")
     assert known("chair near (5.2, 0)", graph) == "hidden: seen too little"
     gone = "removed: absent from its position"
     assert known("chair near (7, 0)", graph) == f"something else there is {gone}"

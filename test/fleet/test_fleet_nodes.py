@@ -79,13 +79,20 @@ def test_a_link_without_a_usable_name_is_refused_in_one_line(tmp_path, name):
     assert "Traceback" not in log
 
 
-def test_a_link_without_a_router_says_so_and_ends_at_once(tmp_path, endpoint):
-    link = {"robot": "ada", "connect": endpoint}
-    with NodeProcess("fleet_link_node", tmp_path, parameters=link) as node, peer() as test:
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("fleet_link_node", "no answer of fleet_node over {}"),
+        ("fleet_node", "no router answers at {}"),
+    ],
+)
+def test_a_node_without_a_router_says_so_and_ends_at_once(tmp_path, endpoint, name, words):
+    link = {"connect": endpoint} | ({"robot": "ada"} if name == "fleet_link_node" else {})
+    with NodeProcess(name, tmp_path, parameters=link) as node, peer() as test:
         statuses = test.statuses()
         node.wait_ready()
         test.spin_until(
-            lambda: any(f"no answer of fleet_node over {endpoint}" in str(s) for s in statuses),
+            lambda: any(words.format(endpoint) in str(s) for s in statuses),
             60.0,
             "the missing router",
         )

@@ -65,6 +65,8 @@ def test_a_label_stays_and_tells_who_said_it(association):
     assert state.classes == [wire.Belief("chair", 1.0)] and state.entropy_nats == 0.0
     room.builder.edit(Undo())
     assert room.full() == before
+    with pytest.raises(RefusedInput, match="blank"):
+        room.builder.edit(SetLabel(1, " "))
     room.builder.edit(SetLabel(1, "chair"))
     assert room.see(20) == [1]  # the detector goes on to call it a cup: that is this object
     room.builder.edit(SetLabel(1, "Anna's mug"))  # in no vocabulary

@@ -1,5 +1,6 @@
 """A bag is data: it runs no program, fills no memory, and no file of it leads to another."""
 
+import os
 import sqlite3
 import struct
 from pathlib import Path
@@ -127,6 +128,24 @@ def test_empty_records_of_a_chunk_end_it(tmp_path, monkeypatch):
     path.write_bytes(storage.MAGIC + record)
     with pytest.raises(RecordingError, match="no message"):
         RawBag(path)
+
+
+@pytest.mark.parametrize("place", ["first", "salvaged"])
+def test_a_record_of_gigabytes_is_not_read(tmp_path, place):
+    size = 12 << 30
+    bag = write_bag(tmp_path / "bag", camera_items(1), "mcap")
+    (file,) = bag.glob("*.mcap")
+    content = file.read_bytes()
+    huge = struct.pack("<BQ", 0x01 if place == "first" else 0x0A, size)
+    with file.open("wb") as out:
+        out.write(storage.MAGIC + huge)
+        out.truncate(out.tell() + size)  # takes no space on the disk
+        out.seek(0, os.SEEK_END)
+        out.write(content[8:])
+    (bag / "metadata.yaml").unlink()
+    messages, losses = read_bag(bag)
+    assert len(messages) == 4
+    assert any(f"{size} bytes and is left out" in loss for loss in losses)
 
 
 # --- topics of two types -----------------------------------------------------------------------

@@ -23,7 +23,7 @@ from deworldsg_ros.streams.images import decode, encoded_size
 
 YAML = (
     *("[" * 100_000, "- " * 100_000, "? " * 100_000, "a: &a [1]\nb: *a", "x: 2020-13-45"),
-    *("x: " + "1" * 5000, "\udcff", "a: b: c"),
+    *("x: " + "1" * 5000, "\udcff", "a: b: c", "a: 1\nb:\n  - c: 2\n    c: 3"),
 )
 JSON = ("[" * 100_000, '"\\ud800"', "{", "1" * 5000)
 STAMPS = ("1e9999999", "1e400", "nan", "-inf", "sNaN", "2147483648", "x")

@@ -222,7 +222,13 @@ def test_output_is_never_overwritten_and_an_interrupted_write_leaves_no_file(tmp
     with pytest.raises(KeyboardInterrupt):
         write_mcap(interrupted(), output)
     assert [file.name for file in tmp_path.iterdir()] == ["bag"]
-    output.write_text("mine")
+
+    def beside():
+        yield from messages
+        output.write_text("mine")
+
+    with pytest.raises(RecordingError, match="exists already"):
+        write_mcap(beside(), output)
     for path in (output, tmp_path / "out.bag", tmp_path / "no" / "out.mcap"):
         with pytest.raises(RecordingError, match="output"):
             write_mcap(messages, path)

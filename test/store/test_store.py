@@ -311,12 +311,27 @@ def test_a_question_has_bounds(tmp_path, monkeypatch):
     assert len(store.ask("UNWIND range(1, 1000) AS x RETURN x").rows) == 1000
     with pytest.raises(StoreError, match="it has 20000000 rows; expected at most"):
         store.ask("UNWIND range(1, 20000000) AS x RETURN x")
-    monkeypatch.setattr(database, "QUESTION_LIMIT_S", 0.3)
+    monkeypatch.setattr(database, "QUESTION_LIMIT_S", 3.0)
     many = " ".join(f"UNWIND range(1, 3000) AS x{i}" for i in range(4))
     started_s = time.monotonic()
-    with pytest.raises(StoreError, match=r"more than 0\.3 s"):
+    with pytest.raises(StoreError, match="more than 3 s"):
         store.ask(f"{many} RETURN sum(x0 * x1 + x2 * x3)")
     assert time.monotonic() - started_s < 20.0
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        "UNWIND range(1, 10000000000) AS x RETURN count(x)",  # 80 GB
+        f"RETURN {'NOT ' * 12_000}true",  # ends ladybug
+        f"RETURN {'[' * 1000}1{']' * 1000}",
+    ],
+)
+def test_a_question_that_ends_the_database_does_not_end_its_asker(tmp_path, question):
+    store = written(tmp_path, graph(1, 1.0, [node(1)]))
+    with pytest.raises(StoreError, match="cannot be answered"):
+        store.ask(question)
+    assert store.ask("MATCH (o:Object) RETURN o.id").rows == [[1]]
 
 
 @pytest.mark.parametrize("name", [MESSAGES_FILE, DATABASE_FILE, "graph.lock"])

@@ -225,8 +225,26 @@ class SqliteFile(Sqlite3Reader):
         super().open()
 
 
+class _RecordsOf:
+    """An open file of which one record is read at a time: its length may claim anything."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.seek, self.tell, self.close = file.seek, file.tell, file.close
+
+    def read(self, size: int = -1) -> bytes:
+        """The next bytes; ReaderError for more than `MAX_CHUNK_BYTES`."""
+        if size > MAX_CHUNK_BYTES:
+            raise ReaderError(f"a record of {size} bytes: expected at most {MAX_CHUNK_BYTES}")
+        return self._file.read(size)
+
+
 class McapFile(McapReader):
     """An .mcap file, whose chunks are unpacked a few at a time."""
+
+    def _open(self) -> None:
+        self.bio = cast(BinaryIO, _RecordsOf(cast(BinaryIO, self.bio)))
+        super()._open()
 
     def messages(
         self,
@@ -352,6 +370,13 @@ def _records(file: BinaryIO, path: Path, note: Callable[[str], None]) -> Iterato
         # The messages at the beginning of a chunk that is cut can still be read.
         if opcode not in OPCODES or (is_cut and opcode != CHUNK):
             return
+        if length > MAX_CHUNK_BYTES:
+            note(
+                f"{path.name}: the record at byte {start} has {length} bytes and is left out: "
+                f"expected at most {MAX_CHUNK_BYTES}"
+            )
+            file.seek(length, os.SEEK_CUR)
+            continue
         yield _Record(start, opcode, file.read(min(length, left)), is_cut)
         if is_cut:
             return

@@ -38,6 +38,8 @@ INTRINSICS = {
     2: (520.9, 521.0, 325.1, 249.7),
     3: (535.4, 539.2, 320.1, 247.6),
 }
+# The longest sequence has 15 000 lines of poses, in 1.5 MB.
+MAX_INDEX_BYTES = 32_000_000
 SEQUENCE_NAME = re.compile(r"(?:freiburg|fr)([123])(?:\D|$)")
 
 
@@ -137,20 +139,23 @@ class TumRgbd(Dataset):
 def _read_index(path: Path, value_count: int) -> list[Entry]:
     """Lines 'stamp value …' in order of time, each with that many values; # starts a comment."""
     entries: list[Entry] = []
-    for number, line in enumerate(read_file(path).decode(errors="replace").splitlines(), start=1):
+    text = read_file(path, most_bytes=MAX_INDEX_BYTES).decode(errors="replace")
+    for number, line in enumerate(text.splitlines(), start=1):
         words = line.split("#")[0].replace(",", " ").split()
         if not words:
             continue
+        where = f"{path}, line {number}: '{line[:80]}'"
         try:
             stamp_ns = stamp_ns_from_text(words[0])
             if value_count > 1:
                 [float(word) for word in words[1:]]
         except ValueError as error:
-            raise RecordingError(f"{path}, line {number}: '{line}': expected numbers") from error
+            raise RecordingError(
+                f"{path}, line {number}: '{line[:80]}': expected numbers"
+            ) from error
         if len(words) <= value_count:
             raise RecordingError(
-                f"{path}, line {number}: '{line}' has {len(words) - 1} values after the stamp: "
-                f"expected {value_count}"
+                f"{where} has {len(words) - 1} values after the stamp: expected {value_count}"
             )
         entries.append(Entry(stamp_ns, tuple(words[1:])))
     if not entries:

@@ -72,6 +72,19 @@ def test_a_folder_is_recognised_and_its_bag_has_the_same_frames(tmp_path, kind):
         np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
 
 
+def test_an_index_without_end_is_refused_in_a_short_line(tmp_path):
+    folder = write("tum", tmp_path)
+    index = folder / "groundtruth.txt"
+    index.write_text("x" * 1_000_000)
+    with pytest.raises(RecordingError) as refused:
+        open_source(folder)
+    assert "expected numbers" in str(refused.value) and len(str(refused.value)) < 500
+    with index.open("r+") as file:
+        file.truncate(200_000_000)
+    with pytest.raises(RecordingError, match="200000000 bytes: expected at most"):
+        open_source(folder)
+
+
 @pytest.mark.parametrize(
     ("kind", "file", "content", "reason"),
     [
