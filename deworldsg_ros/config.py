@@ -324,6 +324,12 @@ class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         bool,
         option("also publish the boxes of the objects to /tf, as object_ID (needs tf2_msgs)"),
     ] = False
+    robot_height_m: Annotated[
+        float,
+        option(
+            "what is higher above the floor is free on /scene_graph/map, metres", ge=0.15, le=10
+        ),
+    ] = 1.5
     include_surface_points: Annotated[
         bool, option("publish the surface points of each node (large messages)")
     ] = False

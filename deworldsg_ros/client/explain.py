@@ -207,6 +207,8 @@ _PLACE = re.compile(
     rf"(.+?)\s+near\s*\(\s*({_NUMBER})\s*,\s*({_NUMBER})\s*(?:,\s*({_NUMBER})\s*)?\)"
     r"(?:\s+within\s+([0-9]{0,9}\.?[0-9]{1,9})\s*(cm|m)?)?"
 )
+# Of a class and a place. The pattern takes the square of the length.
+MAX_PLACE_CHARACTERS = 1000
 _PLACE_LIKE = re.compile(r"\bnear\s*\(")
 
 
@@ -220,6 +222,8 @@ def place_of(text: str, up: Point) -> Place | None:
     Raises:
         ClientError: for other numbers after ``near (``.
     """
+    if len(text) > MAX_PLACE_CHARACTERS:
+        return None
     match = _PLACE.fullmatch(text.strip())
     if match is None:
         if _PLACE_LIKE.search(text):

@@ -14,8 +14,11 @@ from deworldsg_ros.base.files import csv_text, write_atomically
 from deworldsg_ros.base.words import visible
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
-from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.camera import quaternion_from_rotation
+from deworldsg_ros.graph.extent import horizontal_axes
+from deworldsg_ros.graph.floor_plan import FREE, OCCUPIED, UNKNOWN
+from deworldsg_ros.graph.surface import objects_at, surface_of
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt8
+from deworldsg_ros.scene.camera import pose_from_quaternion, quaternion_from_rotation
 from deworldsg_ros.scene.errors import ClientError
 
 # A node of spark_dsg has the symbol of its layer in the upper byte: O for objects, layer 2.
@@ -24,6 +27,10 @@ SPARK_LAYERS = {"AGENTS": 2, "OBJECTS": 2, "PLACES": 3, "ROOMS": 4, "BUILDINGS":
 SPARK_VERSION = {"major": 1, "minor": 1, "patch": 3}
 # Zeroth spherical harmonic: colours of splats are relative to it.
 SH_C0 = 0.28209479177387814
+# Pairs of corners of a box that differ in one bit.
+BOX_EDGES = [(a, a | 1 << axis) for axis in range(3) for a in range(8) if not a & 1 << axis]
+# Cosine of the largest tilt, 6 degrees, at which z still points up.
+LEAST_UPRIGHT = 0.995
 # Splats of flat objects are this thick at least.
 MIN_SIGMA_M = 1e-3
 # Primes: the colours of labels depend on a number modulo their product.
@@ -44,7 +51,8 @@ def export(graph: SceneGraph, kind: str, path: Path) -> list[Path]:
     Args:
         graph: to write.
         kind: a key of `FORMATS`.
-        path: of the file. CSV writes a second one: ``graph.csv`` and ``graph_relations.csv``.
+        path: of the file. CSV writes a second one, ``graph.csv`` and ``graph_relations.csv``, and
+            nav2 too: ``room.yaml`` and ``room.pgm``.
 
     Returns:
         The files written.
@@ -55,8 +63,13 @@ def export(graph: SceneGraph, kind: str, path: Path) -> list[Path]:
     if kind not in FORMATS:
         raise ClientError(f"format '{kind}': expected {', '.join(FORMATS)}")
     written = []
-    for suffix, content in FORMATS[kind](graph).items():
-        target = path.with_name(f"{path.stem}{suffix}{path.suffix}") if suffix else path
+    make = FORMATS[kind]
+    contents = nav2_map(graph, path.stem) if make is nav2_map else make(graph)
+    for suffix, content in contents.items():
+        if suffix.startswith("."):
+            target = path.with_suffix(suffix)
+        else:
+            target = path.with_name(f"{path.stem}{suffix}{path.suffix}") if suffix else path
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(target, content)
@@ -101,6 +114,108 @@ def tables(graph: SceneGraph) -> dict[str, bytes]:
         "": _csv(_OBJECT_COLUMNS, _object_rows(graph)),
         "_relations": _csv(_RELATION_COLUMNS, _relation_rows(graph)),
     }
+
+
+def surface(graph: SceneGraph) -> dict[str, bytes]:
+    """PLY of the room: coloured points with the id of their object (0 = none), and boxes as edges.
+
+    Points and boxes are in the world frame. MeshLab, CloudCompare, Blender and Open3D open it.
+    """
+    points, colours, ids = _surface(graph)
+    boxes = [item for item in graph if all(side > 0 for side in item.size_m)]
+    corners = np.concatenate([np.zeros((0, 3)), *(_corners(item) for item in boxes)])
+    names = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1")]
+    vertices = np.zeros(len(points) + len(corners), [*names, ("blue", "u1"), ("object", "<i4")])
+    for axis, name in enumerate("xyz"):
+        vertices[name] = np.concatenate([points[:, axis], corners[:, axis]])
+    shown = [255 * _colour(item.label) for item in boxes]
+    colours = np.concatenate([colours, np.repeat(np.reshape(shown, (-1, 3)), 8, axis=0)])
+    for channel, name in enumerate(("red", "green", "blue")):
+        vertices[name] = colours[:, channel]
+    vertices["object"] = np.concatenate([ids, np.repeat([item.id for item in boxes], 8)])
+    first = len(points) + 8 * np.arange(len(boxes))
+    edges = (first[:, None, None] + np.array(BOX_EDGES)).reshape(-1, 2).astype("<i4")
+    types = {"f4": "float", "u1": "uchar", "i4": "int"}
+    header = [
+        *("ply", "format binary_little_endian 1.0", f"comment frame {visible(graph.frame_id)}"),
+        *(f"comment object {item.id} {visible(item.label)}" for item in graph),
+        f"element vertex {len(vertices)}",
+        *(
+            f"property {types[vertices.dtype[name].str[1:]]} {name}"
+            for name in vertices.dtype.names or ()
+        ),
+        *(f"element edge {len(edges)}", "property int vertex1", "property int vertex2"),
+        "end_header\n",
+    ]
+    return {"": "\n".join(header).encode() + vertices.tobytes() + edges.tobytes()}
+
+
+def scene(graph: SceneGraph) -> dict[str, bytes]:
+    """GLB of the room: the points of each object, the others, and a box of lines for each object.
+
+    The parts have the names of the objects, so that one can be hidden or cut out; y points up, as
+    glTF wants it. Blender, and the viewers of glTF in browsers and headsets, open it.
+
+    Raises:
+        ClientError: without the package trimesh.
+    """
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ClientError(
+            "GLB needs the package trimesh: pip install 'deworldsg_ros[glb]'"
+        ) from error
+    x, y, up = horizontal_axes(graph.up)
+    turn = np.stack([x, up, -y])
+    points, colours, ids = _surface(graph)
+    shown = trimesh.Scene()
+    names = {0: "room", **{item.id: item.name for item in graph}}
+    for node_id, name in names.items():
+        own = ids == node_id
+        if own.any():
+            cloud = trimesh.PointCloud(points[own] @ turn.T, colors=colours[own])
+            shown.add_geometry(cloud, node_name=visible(name), geom_name=visible(name))
+    for item in graph:
+        if all(side > 0 for side in item.size_m):
+            lines = (_corners(item) @ turn.T)[np.array(BOX_EDGES)]
+            box = trimesh.load_path(lines)
+            box.colors = np.tile(np.append(255 * _colour(item.label), 255), (len(box.entities), 1))
+            name = visible(f"{item.name} box")
+            shown.add_geometry(box, node_name=name, geom_name=name)
+    if shown.is_empty:
+        graph.seen_space()  # says why
+        raise ClientError("nothing to show: no view has depth, and no object has a box")
+    return {"": shown.export(file_type="glb")}
+
+
+def nav2_map(graph: SceneGraph, name: str = "room") -> dict[str, bytes]:
+    """The floor plan as the map server of Nav2 reads it: YAML, and ``NAME.pgm`` beside it.
+
+    Raises:
+        ClientError: if z does not point up; the format has maps of the x-y plane only.
+    """
+    plan = graph.floor_plan()
+    axes = plan.T_world_plan[:3, :3]
+    if axes[2, 2] < LEAST_UPRIGHT:
+        raise ClientError(
+            f"up is {tuple(round(value, 2) for value in graph.up)}: a map of Nav2 needs a world "
+            "frame whose z axis points up, as with odometry, or poses of a robot"
+        )
+    shades = {UNKNOWN: 205, FREE: 254, OCCUPIED: 0}
+    image = np.zeros(plan.cells.shape, np.uint8)
+    for value, shade in shades.items():
+        image[plan.cells == value] = shade
+    x, y, _ = plan.T_world_plan[:3, 3].tolist()
+    yaw = math.atan2(axes[1, 0], axes[0, 0])
+    rows, columns = plan.cells.shape
+    lines = [
+        *(f"image: {json.dumps(f'{name}.pgm')}", "mode: trinary", f"resolution: {plan.cell_m:.4f}"),
+        f"origin: [{x:.4f}, {y:.4f}, {yaw:.5f}]",
+        *("negate: 0", "occupied_thresh: 0.65", "free_thresh: 0.196\n"),
+    ]
+    # The first row of the image is the last one of the plan.
+    pixels = f"P5\n{columns} {rows}\n255\n".encode() + image[::-1].tobytes()
+    return {"": "\n".join(lines).encode(), ".pgm": pixels}
 
 
 def gaussians(graph: SceneGraph) -> dict[str, bytes]:
@@ -159,9 +274,29 @@ def spark_dsg(graph: SceneGraph) -> dict[str, bytes]:
 FORMATS: dict[str, Callable[[SceneGraph], dict[str, bytes]]] = {
     "graphml": graphml,
     "csv": tables,
-    "ply": gaussians,
+    "ply": surface,
+    "glb": scene,
+    "nav2": nav2_map,
+    "splats": gaussians,
     "spark_dsg": spark_dsg,
 }
+
+
+def _surface(graph: SceneGraph) -> tuple[Float32, UInt8, Int64]:
+    """The n points of the room (n, 3), their colours, and the ids of their objects.
+
+    There are none without views of the camera, as in a graph from the topics.
+    """
+    points, colours, _ = surface_of(graph.space).kept()
+    return points, colours, objects_at(points, graph.message.nodes)
+
+
+def _corners(item: SceneObject) -> Float64:
+    """The corners (8, 3) of a box; bit k of the row says on which side along axis k."""
+    bits = np.array([[(row >> axis) & 1 for axis in range(3)] for row in range(8)])
+    T_world_box = pose_from_quaternion(np.array(item.position_m), np.array(item.orientation_xyzw))
+    local = (bits - 0.5) * np.array(item.size_m)
+    return np.asarray(local @ T_world_box[:3, :3].T + T_world_box[:3, 3])
 
 
 def _object_rows(graph: SceneGraph) -> list[dict[str, object]]:

@@ -44,10 +44,13 @@ from deworldsg_ros.client.objects import (
     predicate_names,
     relation_of,
     scene_object,
+    to_networkx,
 )
 from deworldsg_ros.client.text_tower import embed_text
 from deworldsg_ros.graph.embeddings import Looks, embeddings_path, read_embeddings
 from deworldsg_ros.graph.extent import DEFAULT_UP
+from deworldsg_ros.graph.floor_plan import CELL_M as PLAN_CELL_M
+from deworldsg_ros.graph.floor_plan import FloorPlan, floor_plan
 from deworldsg_ros.graph.graph_files import graph_path, read_graph
 from deworldsg_ros.graph.provenance import SeenFrames, SeenSpace, read_seen, read_space
 from deworldsg_ros.scene.arrays import Float32, Float64
@@ -133,50 +136,6 @@ def _radius_m(node: wire.NodeState) -> float:
     return 0.5 * (a * a + b * b + c * c) ** 0.5 + 1e-6
 
 
-# --- The graph as a networkx graph.
-
-
-def to_networkx(objects: Iterable[SceneObject], relations: Iterable[Relation]) -> Any:
-    """A networkx.MultiDiGraph: a node for each object id, an edge with the predicate as its key.
-
-    Attributes are numbers and strings only, so that every writer of networkx takes them.
-
-    Raises:
-        ClientError: without the package networkx.
-    """
-    try:
-        import networkx
-    except ImportError as error:
-        raise ClientError("networkx is not installed: pip install networkx") from error
-    graph = networkx.MultiDiGraph()
-    for item in objects:
-        x, y, z = item.position_m
-        length, width, height = item.size_m
-        graph.add_node(
-            item.id,
-            label=item.label,
-            probability=round(item.probability, 4),
-            observations=item.observations,
-            x=x,
-            y=y,
-            z=z,
-            length=length,
-            width=width,
-            height=height,
-        )
-    for relation in relations:
-        graph.add_edge(
-            relation.subject.id,
-            relation.object.id,
-            key=relation.predicate,
-            predicate=relation.predicate,
-            probability=round(relation.probability, 4),
-            provenance=relation.provenance,
-            observations=relation.observations,
-        )
-    return graph
-
-
 # --- The most probable chain of relations between two objects.
 
 
@@ -221,6 +180,8 @@ NO_LOOKS = (
 )
 # Characters of a name in an error, and of a name at all: words are compared with many others.
 MOST_SHOWN, MAX_NAME = 60, 500
+# Cells of a floor plan.
+MIN_CELL_M, MAX_CELL_M = 0.01, 1.0
 
 
 @dataclass(frozen=True)
@@ -540,6 +501,32 @@ class SceneGraph:
         return goal_near(
             target, self, distance, self.stamp_ns, robot=robot, towards=towards, space=seen
         )
+
+    def seen_space(self) -> SeenSpace:
+        """What the camera saw: depth images of different views; ClientError if not at hand."""
+        if self.space is None or not len(self.space):
+            raise ClientError(
+                "the graph has no views of the camera: they are in scene_graph.space.npz beside "
+                "the graph of a run, and in maps, and not on the topics"
+            )
+        return self.space
+
+    def floor_plan(self, robot: Robot = Robot(), cell_m: float = PLAN_CELL_M) -> FloorPlan:
+        """Where a robot can go, and where something is, as far as the camera saw it.
+
+        Args:
+            robot: what is higher than it, is not in its way; its width is left to the planner.
+            cell_m: width of a cell, from 1 cm to 1 m.
+
+        Raises:
+            ClientError: without views of the camera, or for another width.
+        """
+        if not MIN_CELL_M <= cell_m <= MAX_CELL_M:
+            raise ClientError(f"cells of {cell_m:g} m: expected {MIN_CELL_M:g} to {MAX_CELL_M:g}")
+        plan = floor_plan(self.seen_space(), self.up, robot.height_m, cell_m=cell_m)
+        if plan is None:
+            raise ClientError("the views of the camera show nothing: no depth in any of them")
+        return plan
 
     def take_embeddings(self, path: str | Path) -> None:
         """Take the embeddings of the map that was saved with this graph, or of another file.

@@ -14,6 +14,7 @@ from deworldsg_ros.client.boxes import Footprint, footprint
 from deworldsg_ros.client.meanings import colour_shares, is_class, words_of
 from deworldsg_ros.graph.extent import box_of, surface_points
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.scene.vocabulary import PREDICATES, plain, verb_of
 from deworldsg_ros.wire import messages as wire
 
@@ -395,3 +396,47 @@ def _point(values: Any) -> Point:
 
 def _rounded(values: tuple[float, ...], decimals: int = 3) -> list[float]:
     return [round(value, decimals) + 0.0 for value in values]
+
+
+# --- The graph as a networkx graph.
+
+
+def to_networkx(objects: Iterable[SceneObject], relations: Iterable[Relation]) -> Any:
+    """A networkx.MultiDiGraph: a node for each object id, an edge with the predicate as its key.
+
+    Attributes are numbers and strings only, so that every writer of networkx takes them.
+
+    Raises:
+        ClientError: without the package networkx.
+    """
+    try:
+        import networkx
+    except ImportError as error:
+        raise ClientError("networkx is not installed: pip install networkx") from error
+    graph = networkx.MultiDiGraph()
+    for item in objects:
+        x, y, z = item.position_m
+        length, width, height = item.size_m
+        graph.add_node(
+            item.id,
+            label=item.label,
+            probability=round(item.probability, 4),
+            observations=item.observations,
+            x=x,
+            y=y,
+            z=z,
+            length=length,
+            width=width,
+            height=height,
+        )
+    for relation in relations:
+        graph.add_edge(
+            relation.subject.id,
+            relation.object.id,
+            key=relation.predicate,
+            predicate=relation.predicate,
+            probability=round(relation.probability, 4),
+            provenance=relation.provenance,
+            observations=relation.observations,
+        )
+    return graph

@@ -5,10 +5,16 @@ It is for people and planners, and no part of the paper's method: it changes not
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
+from itertools import islice
+
 import numpy as np
 
 from deworldsg_ros.graph.provenance import SeenSpace, seen_in
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt8, UInt16
+from deworldsg_ros.scene.camera import pose_from_quaternion
+from deworldsg_ros.wire import messages as wire
 
 # A cell has one point. Those of larger rooms are wider, by this factor once or more.
 CELL_M, WIDER = 0.02, 1.3
@@ -18,6 +24,8 @@ MOST_POINTS = 150_000
 LEAST_ALIKE, ALIKE_M, ALIKE_FRACTION = 2, 0.03, 0.05
 # A point goes when as many views see through it as saw it. At most so many that saw it count.
 MOST_VOTES = 4
+# A point belongs to an object up to so far outside of its box: the error of both.
+BOX_MARGIN_M = 0.02
 # Bits of a coordinate of a cell, and the cell at the origin.
 _BITS, _MIDDLE = 21, 1 << 20
 
@@ -127,6 +135,33 @@ class Surface:
         return np.asarray((parts[:, 0] << 2 * _BITS) | (parts[:, 1] << _BITS) | parts[:, 2])
 
 
+class SurfaceOfSpace:
+    """The surface of a graph whose views become more: only new views are added.
+
+    The points of the oldest views stay when these are dropped. Views that moved make all anew.
+    """
+
+    def __init__(self) -> None:
+        self._surface = Surface()
+        self._poses: Float64 = np.zeros((0, 4, 4))
+        self._stamps_ns: Int64 = np.zeros(0, np.int64)
+
+    def of(self, space: SeenSpace) -> Surface:
+        """The surface of these views; the next call changes it."""
+        dropped = int(np.searchsorted(self._stamps_ns, space.stamps_ns[:1]).sum())
+        count = len(self._stamps_ns) - dropped
+        if not (
+            count
+            and np.array_equal(self._stamps_ns[dropped:], space.stamps_ns[:count])
+            and np.array_equal(self._poses[dropped:], space.poses[:count])
+        ):
+            self._surface, count = Surface(), 0
+        for view in islice(space.views(), count, None):
+            self._surface.add(*view)
+        self._poses, self._stamps_ns = space.poses, space.stamps_ns
+        return self._surface
+
+
 def surface_of(space: SeenSpace | None, most_points: int = MOST_POINTS) -> Surface:
     """The surface that the views of a graph show, the oldest first."""
     surface = Surface(most_points)
@@ -134,6 +169,28 @@ def surface_of(space: SeenSpace | None, most_points: int = MOST_POINTS) -> Surfa
         for view in space.views():
             surface.add(*view)
     return surface
+
+
+def objects_at(points: Float32, nodes: Iterable[wire.NodeState]) -> Int64:
+    """The id of the object whose box has each point (n, 3); 0 = none, of several the smallest box.
+
+    Args:
+        points: world, metres.
+        nodes: of a message.
+    """
+    ids = np.zeros(len(points), np.int64)
+    order = np.argsort(points[:, 0], kind="stable")
+    x = points[order, 0]
+    boxes = [(node.id, node.box) for node in nodes if isinstance(node.box, wire.GravityBox)]
+    for node_id, box in sorted(boxes, key=lambda item: -math.prod(item[1].size_m)):
+        half = np.asarray(box.size_m) / 2 + BOX_MARGIN_M
+        center, reach = np.asarray(box.center_m), float(np.linalg.norm(half))
+        first, last = np.searchsorted(x, (center[0] - reach, center[0] + reach))
+        near = order[first:last]
+        T_world_box = pose_from_quaternion(center, np.asarray(box.orientation_xyzw))
+        local = (points[near] - center) @ T_world_box[:3, :3]
+        ids[near[(np.abs(local) <= half).all(axis=1)]] = node_id
+    return ids
 
 
 def _is_smooth(depth_mm: UInt16) -> Bool:

@@ -33,7 +33,7 @@ from deworldsg_ros.map_file import (
     write_map,
     write_state,
 )
-from deworldsg_ros.ros.graph_output import EmbeddingTopic, MakeMarkers, WholeGraph
+from deworldsg_ros.ros.graph_output import EmbeddingTopic, MakeMarkers, RoomTopics, WholeGraph
 from deworldsg_ros.ros.health import HIDDEN
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.options import Parameters
@@ -423,6 +423,7 @@ class GraphKeeper:
         self._rivals = Rivals(node, lambda: self._session, lambda: self.submit(self._tell_again))
         self._whole = WholeGraph(node, markers)
         self._embeddings = EmbeddingTopic(node)
+        self._room = RoomTopics(node)
         self.files = GraphFiles(node)
         # None until a map or the first local graph gives the world frame and the vocabulary.
         continued = self.files.continued_map()
@@ -464,6 +465,7 @@ class GraphKeeper:
         """End the threads, then write the map file."""
         ended = self._worker.stop()
         self._whole.close()
+        self._room.close()
         self.files.close(self._builder, busy=not ended)
 
     def problems(self) -> list[str]:
@@ -568,7 +570,9 @@ class GraphKeeper:
         now_s = time.monotonic()
         with self._node.refusing():
             self._embeddings.publish(self._builder, self._session, now_s)
-        parts = (self._times, self._whole, self.files, self._embeddings)
+        with self._node.refusing():
+            self._room.publish(self._builder, now_s)
+        parts = (self._times, self._whole, self.files, self._embeddings, self._room)
         waits = (part.wait_s(now_s) for part in parts)
         return min((wait_s for wait_s in waits if wait_s is not None), default=None)
 

@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Hashable, Iterable
+from array import array
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import suppress
+from copy import copy
 from importlib import import_module
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
+import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point
+from nav_msgs.msg import OccupancyGrid
+from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from deworldsg_ros.graph.embeddings import embeddings_message
+from deworldsg_ros.graph.extent import DEFAULT_UP
+from deworldsg_ros.graph.floor_plan import FloorPlan, floor_plan
+from deworldsg_ros.graph.provenance import SeenSpace
+from deworldsg_ros.graph.surface import Surface, SurfaceOfSpace, objects_at
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.threads import Worker
+from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import ChangeLog
 
@@ -198,6 +208,139 @@ class EmbeddingTopic:
             message.session = session
             self._publisher.publish(String(data=wire.encode(message)))
             self._due_s += (time.monotonic() - now_s) / MAX_SHARE
+
+
+# --- The room: its surface as coloured points, and its floor plan, for those who want them.
+
+POINTS_TOPIC, MAP_TOPIC = "scene_graph/points", "scene_graph/map"
+ROOM_PERIOD_S = 2.0
+# Fields of a point: `rgb` as PCL and RViz read it, and the id of the object that it belongs to.
+POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("object", "<u4")])
+
+
+def point_cloud(
+    surface: Surface, nodes: Sequence[wire.NodeState], frame_id: str, stamp: Any
+) -> PointCloud2:
+    """The kept points of a surface, with colours and ids of objects (0 = none).
+
+    Args:
+        surface: of the room.
+        nodes: of the graph.
+        frame_id: world frame.
+        stamp: builtin_interfaces/Time.
+    """
+    points, colours, _ = surface.kept()
+    values = np.zeros(len(points), POINT)
+    for axis, name in enumerate("xyz"):
+        values[name] = points[:, axis]
+    values["rgb"] = colours.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    values["object"] = objects_at(points, nodes)
+    kinds = {"object": PointField.UINT32}
+    offsets: Any = POINT.fields
+    cloud = PointCloud2(
+        height=1, width=len(values), point_step=POINT.itemsize, row_step=values.nbytes
+    )
+    cloud.header.frame_id, cloud.header.stamp = frame_id, stamp
+    cloud.is_dense = True
+    cloud.fields = [
+        PointField(
+            name=name,
+            offset=int(offsets[name][1]),
+            datatype=kinds.get(name, PointField.FLOAT32),
+            count=1,
+        )
+        for name in POINT.names or ()
+    ]
+    cloud.data = array("B", values.tobytes())
+    return cloud
+
+
+def occupancy_grid(plan: FloorPlan, frame_id: str, stamp: Any) -> OccupancyGrid:
+    """A floor plan; its origin turns if the world's z axis does not point up."""
+    grid = OccupancyGrid()
+    grid.header.frame_id, grid.header.stamp = frame_id, stamp
+    grid.info.map_load_time = stamp
+    grid.info.resolution = plan.cell_m
+    grid.info.height, grid.info.width = plan.cells.shape
+    _set(grid.info.origin.position, "xyz", plan.T_world_plan[:3, 3].tolist())
+    turn = quaternion_from_rotation(plan.T_world_plan[:3, :3])
+    _set(grid.info.origin.orientation, "xyzw", turn.tolist())
+    grid.data = array("b", plan.cells.tobytes())
+    return grid
+
+
+class _Room(NamedTuple):
+    """What is to be published, and for whom."""
+
+    space: SeenSpace
+    snapshot: wire.SceneGraphMessage
+    points: bool
+    height_m: float  # 0 = nobody wants the plan
+
+
+class RoomTopics:
+    """Publishes the room when it has changed, while somebody listens, and to new subscribers.
+
+    The surface is made in a thread of its own, of the views that the graph keeps; it costs nothing
+    without subscribers.
+    """
+
+    def __init__(self, node: StageNode) -> None:
+        self._node = node
+        self._points = node.create_publisher(PointCloud2, POINTS_TOPIC, reliable(1, latched=True))
+        self._plan = node.create_publisher(OccupancyGrid, MAP_TOPIC, reliable(1, latched=True))
+        # What was published last, and for whom.
+        self._known = SeenSpace()
+        self._wanted: tuple[float, ...] = ()
+        self._due_s, self._is_needed = 0.0, False
+        self._surface = SurfaceOfSpace()
+        self._worker: Worker[_Room] = Worker(
+            "room", self._work, size=1, on_overrun=lambda room: None
+        )
+
+    def wait_s(self, now_s: float) -> float | None:
+        """Seconds until `publish` looks again, 0 = now; None for a graph without views."""
+        return max(0.0, self._due_s - now_s) if self._is_needed else None
+
+    def publish(self, builder: GraphBuilder | None, now_s: float) -> None:
+        """Publish what is due."""
+        self._is_needed = builder is not None and len(builder.space) > 0
+        if builder is None or not self._is_needed or now_s < self._due_s:
+            return
+        self._due_s = now_s + ROOM_PERIOD_S
+        listeners = [p.get_subscription_count() for p in (self._points, self._plan)]
+        if not any(listeners):
+            self._wanted = ()
+            return
+        space = copy(builder.space)  # its arrays are replaced, and never changed
+        known, wanted = self._known, (self._node.parameters.output.robot_height_m, *listeners)
+        is_same = space.stamps_ns is known.stamps_ns and space.poses is known.poses
+        if (is_same and wanted == self._wanted) or not self._worker.wait_idle(0.0):
+            return
+        self._known, self._wanted = space, wanted
+        height_m = wanted[0] if listeners[1] else 0.0
+        self._worker.submit(_Room(space, builder.snapshot(), listeners[0] > 0, height_m))
+
+    def close(self) -> None:
+        """End the thread."""
+        self._worker.stop()
+
+    def _work(self, room: _Room) -> None:
+        started_s = time.monotonic()
+        snapshot = room.snapshot
+        stamp = Time(sec=snapshot.stamp.sec, nanosec=snapshot.stamp.nanosec)
+        up = snapshot.up if isinstance(snapshot.up, list) else DEFAULT_UP
+        with self._node.refusing():
+            surface = self._surface.of(room.space)
+            if room.points:
+                cloud = point_cloud(surface, snapshot.nodes, snapshot.frame_id, stamp)
+                self._points.publish(cloud)
+            if room.height_m:
+                plan = floor_plan(room.space, up, room.height_m, surface)
+                if plan is not None:
+                    self._plan.publish(occupancy_grid(plan, snapshot.frame_id, stamp))
+        now_s = time.monotonic()
+        self._due_s = max(self._due_s, now_s + (now_s - started_s) / MAX_SHARE)
 
 
 # --- The whole graph on /scene_graph and as markers, slowly and in the background.

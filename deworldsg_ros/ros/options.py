@@ -16,6 +16,7 @@ LIVE_GRAPH = (
     "relations.geo_cost_threshold",
     "output.min_existence",
     "output.rate_hz",
+    "output.robot_height_m",
 )
 
 

@@ -3,9 +3,17 @@
 import numpy as np
 import pytest
 from support.merging import VOCABULARY, local_graph
+from support.spaces import BLOCK, BLOCK_RGB, add_view, looking, seen_room
+from support.view import box_at, make_node
 
 from deworldsg_ros.graph.provenance import GREY, SeenSpace
-from deworldsg_ros.graph.surface import CELL_M, Surface, surface_of
+from deworldsg_ros.graph.surface import (
+    CELL_M,
+    Surface,
+    SurfaceOfSpace,
+    objects_at,
+    surface_of,
+)
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import DepthGrid
 
@@ -109,3 +117,35 @@ def test_the_views_of_a_graph_keep_their_colours():
     again.restore(older)
     assert (again.colours == GREY).all() and again.colours.shape == (3, HEIGHT, WIDTH, 3)
     assert len(surface_of(None)) == 0
+
+
+def test_points_have_the_id_of_the_smallest_box_around_them():
+    points, colours, _ = surface_of(seen_room()).kept()
+    low, high = np.array(BLOCK)
+    block = box_at(((low + high) / 2).tolist(), (high - low).tolist())
+    room = box_at([0, 0, 1.25], [3.8, 2.8, 2.6])
+    nodes = [make_node(7, "box", box=block), make_node(9, "room", box=room), make_node(3, "x")]
+    for order in (nodes, nodes[::-1]):
+        ids = objects_at(points, order)
+        is_block = (colours == BLOCK_RGB).all(axis=1)
+        assert is_block.sum() > 100
+        assert set(ids[is_block]) == {7}
+        assert set(ids[~is_block & (np.abs(points[:, 0]) > 1.95)]) == {0}
+        assert 9 in ids
+
+
+def test_a_surface_that_grows_is_that_of_all_views_and_one_that_moved_is_made_anew():
+    space, grown = seen_room(), SurfaceOfSpace()
+    first = grown.of(space)
+    add_view(space, looking((-1.0, 0.5, 1.2), -40.0), 10**11)
+    assert grown.of(space) is first
+    np.testing.assert_array_equal(first.kept()[0], surface_of(space).kept()[0])
+    count = len(first.kept()[0])
+    for name in ("depths_mm", "colours", "poses", "cameras", "stamps_ns"):
+        setattr(space, name, getattr(space, name)[3:])  # as when there are too many
+    assert len(grown.of(space).kept()[0]) == count
+    space.move(at(5.0), 0)
+    moved = grown.of(space)
+    assert moved is not first
+    assert moved.kept()[0][:, 0].min() > 2.0
+    assert len(grown.of(SeenSpace())) == 0

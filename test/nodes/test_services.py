@@ -13,6 +13,9 @@ import yaml
 from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import PoseStamped
 from msgspec.structs import replace
+from nav_msgs.msg import OccupancyGrid
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.nodes_bench import LIMIT_S, Bench
@@ -371,3 +374,28 @@ def test_without_a_graph_or_a_node_the_client_says_so(tmp_path):
         robot.ask(client.undo)
     with SceneGraphClient("/nobody") as client, pytest.raises(ClientError, match="is graph_node"):
         client.undo()
+
+
+def test_the_room_is_published_while_somebody_listens(robot):
+    clouds, plans = [], []
+    node = robot.peer.node
+    latched = reliable(1, latched=True)
+    robot.see()
+    node.create_subscription(PointCloud2, "scene_graph/points", clouds.append, latched)
+    robot.expect(lambda: clouds, "the points")
+    assert not plans
+    (cloud,) = clouds
+    assert (cloud.header.frame_id, cloud.point_step) == ("world", 20)
+    assert cloud.width > 100
+    node.create_subscription(OccupancyGrid, "scene_graph/map", plans.append, latched)
+    robot.expect(lambda: plans, "the floor plan")
+    assert plans[0].info.width * plans[0].info.height == len(plans[0].data)
+    # A new subscriber gets what is there.
+    later = []
+    node.create_subscription(PointCloud2, "scene_graph/points", later.append, latched)
+    robot.expect(lambda: later, "the points")
+    # Another height of the robot makes another plan.
+    count = len(plans)
+    changed = robot.node.set_parameters([Parameter("output.robot_height_m", value=0.3)])
+    assert changed[0].successful
+    robot.expect(lambda: len(plans) > count, "the plan of a low robot")

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseWithCovariance, Quaternion, Vector3
+from sensor_msgs.msg import PointField
 from std_msgs.msg import Header
 from support.room_nodes import add_node, room, table, thing
-from support.view import make_graph, make_node
+from support.spaces import BLOCK, BLOCK_RGB, seen_room
+from support.view import box_at, make_graph, make_node
 from visualization_msgs.msg import Marker
 
+from deworldsg_ros.graph.floor_plan import floor_plan
+from deworldsg_ros.graph.surface import surface_of
 from deworldsg_ros.ros import graph_output, transforms
 from deworldsg_ros.ros.graph_output import PiecewiseEncoder, marker_array
 from deworldsg_ros.ros.transforms import object_transforms
@@ -68,6 +72,44 @@ def test_every_object_with_a_box_is_a_frame(monkeypatch):
     monkeypatch.setattr(transforms, "TFMessage", None)
     with pytest.raises(ConfigurationError, match="output.publish_tf .* tf2_msgs"):
         transforms.ObjectTransforms(Value())
+
+
+def test_the_room_is_a_point_cloud_with_colours_and_ids_of_objects():
+    low, high = np.array(BLOCK)
+    node = make_node(7, "box", box=box_at((low + high) / 2, high - low))
+    surface = surface_of(seen_room())
+    cloud = graph_output.point_cloud(surface, [node], "map", Time(sec=3))
+    assert (cloud.header.frame_id, cloud.header.stamp.sec, cloud.height) == ("map", 3, 1)
+    kinds = {PointField.FLOAT32: "<f4", PointField.UINT32: "<u4"}
+    fields = {f.name: (kinds[f.datatype], f.offset) for f in cloud.fields}
+    assert list(fields) == ["x", "y", "z", "rgb", "object"]
+    kind = np.dtype(
+        {
+            "names": list(fields),
+            "formats": [kind for kind, _ in fields.values()],
+            "offsets": [offset for _, offset in fields.values()],
+            "itemsize": cloud.point_step,
+        }
+    )
+    values = np.frombuffer(bytes(cloud.data), kind)
+    assert len(values) == cloud.width == cloud.row_step / cloud.point_step
+    points, colours, _ = surface.kept()
+    np.testing.assert_array_equal(np.stack([values[axis] for axis in "xyz"], axis=1), points)
+    blue, green, red = np.ascontiguousarray(values["rgb"]).view("u1").reshape(-1, 4)[:, :3].T
+    np.testing.assert_array_equal(np.stack([red, green, blue], axis=1), colours)
+    assert set(values["object"][(colours == BLOCK_RGB).all(axis=1)]) == {7}
+
+
+def test_the_floor_plan_is_an_occupancy_grid():
+    plan = floor_plan(seen_room(), (0.0, 0.0, 1.0), 1.5)
+    grid = graph_output.occupancy_grid(plan, "map", Time(sec=3))
+    assert (grid.header.frame_id, grid.info.resolution) == ("map", pytest.approx(0.05))
+    cells = np.array(grid.data).reshape(grid.info.height, grid.info.width)
+    np.testing.assert_array_equal(cells, plan.cells)
+    origin = grid.info.origin
+    column, row = (np.array([0.8, 0.0]) - [origin.position.x, origin.position.y]) / 0.05
+    assert cells[int(row), int(column)] == 100
+    assert (origin.orientation.w, origin.position.z) == (1.0, pytest.approx(0.0, abs=0.02))
 
 
 def test_a_marker_array_replaces_all_markers():

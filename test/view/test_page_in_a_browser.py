@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from support.browser import browser, opened_page, pixels_of, until
 from support.merging import local_graph
-from support.view import SAVED, make_edge, make_graph, make_node
+from support.spaces import BLOCK, BLOCK_RGB, seen_room
+from support.view import SAVED, box_at, make_edge, make_graph, make_node
 
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.graph.provenance import SeenSpace
@@ -147,6 +148,46 @@ def test_the_room_is_drawn_and_steps_back_behind_a_chosen_object(chromium, tmp_p
         until(shown, "layers.room.material.opacity < 0.5", "it steps back")
         shown.locator("#switches label", has_text="room").click()
         until(shown, "!layers.room.visible", "it is hidden")
+
+
+def test_an_object_is_cut_out_of_the_room_and_stands_out_when_chosen(chromium, tmp_path):
+    path, (low, high) = tmp_path / "graph.html", np.array(BLOCK)
+    box = box_at((low + high) / 2, high - low)
+    nodes = [make_node(7, "box", box=box), make_node(8, "cup", (-1.5, 1.0, 0.5))]
+    page.write(make_graph(nodes), path, space=seen_room())
+
+    def reds(shown):
+        """Share of the picture that is the block's, in its full colour."""
+        return (np.abs(pixels(shown) - BLOCK_RGB).max(axis=2) < 40).mean()
+
+    count = "layers.room.geometry.attributes.position.count"
+    with opened_page(chromium, path.as_uri()) as shown:
+        until(shown, f"layers.room.visible && {count} > 1000", "the room")
+        rows = shown.evaluate(count)
+        shown.evaluate(
+            "camera.position.set(-1.5, -0.2, 1.4), controls.target.set(0.8, 0, 0.4), "
+            "hiddenKinds.add('boxes').add('labels'), controls.update(), draw('choice')"
+        )
+        before = reds(shown)
+        assert before > 0.02
+        shown.evaluate(
+            "choose(8), camera.position.set(-1.5, -0.2, 1.4), "
+            "controls.target.set(0.8, 0, 0.4), controls.update(), draw()"
+        )
+        assert reds(shown) < 0.3 * before  # it steps back with the room
+        shown.evaluate(
+            "choose(7), camera.position.set(-1.5, -0.2, 1.4), "
+            "controls.target.set(0.8, 0, 0.4), controls.update(), draw()"
+        )
+        assert reds(shown) > 0.8 * before  # and stays as it is when it is the chosen one
+        shown.locator("#card a", has_text="cut it out").click()
+        until(shown, f"{count} < {rows} - 100", "a room without the block")
+        assert reds(shown) < 0.1 * before
+        shown.locator("#card a", has_text="put it back").click()
+        until(shown, f"{count} === {rows}", "the whole room")
+        shown.evaluate("choose(null)")
+        shown.locator("#list li.class", has_text="box").locator("input").click()
+        until(shown, f"{count} < {rows} - 100", "a room without boxes")
 
 
 def test_names_are_text_whatever_they_contain(chromium, tmp_path):

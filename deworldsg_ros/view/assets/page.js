@@ -29,13 +29,15 @@ function element(tag, className, text) {
 // So many edges are "near" that they hide the others.
 const hiddenPredicates = new Set(["near"]);
 const hiddenClasses = new Set();
+const cutOut = new Set();  // ids of single objects that are hidden
 const hiddenKinds = new Set(["Gaussians", "follow"]);
 const least = { object: 0, relation: 0.5 };
 let chosen = null;  // id of the object that was clicked
 let pointed = null;  // id of the object under the pointer
 
 const isOf = (edge, id) => edge.subject === id || edge.object === id;
-const showsNode = node => !hiddenClasses.has(node.label) && node.probability >= least.object;
+const isCut = node => hiddenClasses.has(node.label) || cutOut.has(node.id);
+const showsNode = node => !isCut(node) && node.probability >= least.object;
 
 // Of two equal relations in both directions, the less probable one says nothing more.
 function isDouble(edge) {
@@ -86,13 +88,24 @@ const room = { places: new Float32Array(0), colours: new Float32Array(0), sides:
 let hasChosenPoints = false;  // else those of the room take the place of those of the objects
 layers.room = new THREE.Points(empty(), new THREE.PointsMaterial(
   { vertexColors: true, transparent: true, size: 0.03 }));
-// A wall is seen from its own side: from outside one looks into the room.
+// A wall is seen from its own side: from outside one looks into the room. The points of the first
+// object stay as they are when the others step back.
+const inFirst = { value: new THREE.Matrix4() }, hasFirst = { value: 0 };
 layers.room.material.onBeforeCompile = shader => {
+  Object.assign(shader.uniforms, { inFirst, hasFirst });
   shader.vertexShader = shader.vertexShader
-    .replace("void main() {", "attribute vec3 side;\nvoid main() {")
+    .replace("void main() {", `attribute vec3 side;
+      uniform mat4 inFirst; uniform float hasFirst; varying float isFirst;
+      void main() {
+        vec3 inside = abs((inFirst * vec4(position, 1.0)).xyz);
+        isFirst = hasFirst * step(max(inside.x, max(inside.y, inside.z)), 1.0);`)
     .replace("#include <project_vertex>", `#include <project_vertex>
       if (dot(normalize(cameraPosition - position), side) < -0.1)
         gl_Position = vec4(2.0, 2.0, 2.0, 1.0);`);
+  shader.fragmentShader = shader.fragmentShader
+    .replace("void main() {", "varying float isFirst;\nvoid main() {")
+    .replace("#include <color_fragment>", `#include <color_fragment>
+      diffuseColor.a = mix(diffuseColor.a, 1.0, isFirst);`);
 };
 layers.room.frustumCulled = false;
 layers.room.renderOrder = -1;
@@ -120,9 +133,44 @@ function addToRoom({ from = 0, gone = [], origin, step, cell, steps, rgb, sides:
   Object.assign(room, { places, colours, sides, cell: cell ?? room.cell });
 }
 
+// A point belongs to an object up to so far outside of its box, metres.
+const MARGIN = 0.02;
+
+// From the world to a box whose sides are at -1 and 1.
+function toBox({ centre, axes, size }) {
+  const rows = [0, 1, 2].flatMap(k => {
+    const axis = axes.slice(3 * k, 3 * k + 3), half = size[k] / 2 + MARGIN;
+    return [...axis.map(value => value / half),
+      -axis.reduce((sum, value, at) => sum + value * centre[at], 0) / half];
+  });
+  return new THREE.Matrix4().set(...rows, 0, 0, 0, 1);
+}
+
+// Rows of the room's points that are not drawn: what went, and what is in a hidden object.
+function leftOut() {
+  const out = new Set(room.gone), places = room.places;
+  for (const node of nodes.values()) {
+    if (!isCut(node)) continue;
+    const m = toBox(node).elements;
+    for (let at = 0; at < places.length; at += 3) {
+      const x = places[at], y = places[at + 1], z = places[at + 2];
+      if (Math.abs(m[0] * x + m[4] * y + m[8] * z + m[12]) <= 1 &&
+          Math.abs(m[1] * x + m[5] * y + m[9] * z + m[13]) <= 1 &&
+          Math.abs(m[2] * x + m[6] * y + m[10] * z + m[14]) <= 1) out.add(at / 3);
+    }
+  }
+  return out;
+}
+
+// Which objects are hidden, and about where.
+const cuts = () => [...nodes.values()].filter(isCut)
+  .map(({ id, centre, size }) => [id, ...[...centre, ...size].map(value => value.toFixed(2))]).join();
+let drawnCuts = "";
+
 function drawRoom() {
-  const isKept = (_, at) => !room.gone.has(Math.floor(at / 3));
-  const kept = values => room.gone.size ? values.filter(isKept) : values;
+  drawnCuts = cuts();
+  const out = leftOut(), isKept = (_, at) => !out.has(Math.floor(at / 3));
+  const kept = values => out.size ? values.filter(isKept) : values;
   const sides = Float32Array.from(kept(room.sides), value => value / 127);
   const shape = new THREE.BufferGeometry();
   shape.setAttribute("position", new THREE.Float32BufferAttribute(kept(room.places), 3));
@@ -142,7 +190,10 @@ function drawRoom() {
 // The room steps back behind a chosen object. Its floor takes the place of the grid.
 function dimRoom() {
   layers.room.visible = room.places.length > 0 && !hiddenKinds.has("room");
-  layers.room.material.opacity = (pointed ?? chosen) === null ? 1 : 0.35;
+  const first = pointed ?? chosen;
+  layers.room.material.opacity = first === null ? 1 : 0.35;
+  hasFirst.value = first === null ? 0 : 1;
+  if (first !== null) inFirst.value.copy(toBox(nodes.get(first)));
   if (floor) floor.visible = room.places.length < 3000 || hiddenKinds.has("room");
 }
 
@@ -421,7 +472,7 @@ function draw(...parts) {
     const parts = new Set(due);
     due.clear();
     if (parts.has("all")) measure();
-    if (parts.has("room")) drawRoom();
+    if (parts.has("room") || cuts() !== drawnCuts) drawRoom();
     else if (parts.has("all") || parts.has("choice")) dimRoom();
     if (parts.has("all") || parts.has("choice")) {
       drawBoxes();
@@ -491,6 +542,10 @@ function showCard(id) {
     close.onclick = () => choose(null);
     title.append(close);
   }
+  const cut = element("a", "hint", cutOut.has(id) ? "put it back" : "cut it out");
+  cut.title = "without its box, its relations and its part of the room";
+  cut.onclick = () => { cutOut.delete(id) || cutOut.add(id); draw("choice"); };
+  parts.push(cut);
   if (photos.has(id)) {
     const photo = element("img", "photo");
     photo.alt = "best view of the object";
@@ -735,6 +790,7 @@ function apply(message) {
   for (const [id, stamp] of message.photos ?? []) photos.set(id, stamp);
   if (message.path) path = path.slice(0, message.from ?? 0).concat(message.path);
   if (message.camera) eye = message.camera;
+  for (const id of message.removed ?? []) cutOut.delete(id);
   if (!nodes.has(chosen)) chosen = null;
   if (!nodes.has(pointed)) pointed = null;
   const count = [...edges.values()].filter(edge => !isDouble(edge)).length;
@@ -765,7 +821,7 @@ function connect() {
   socket.binaryType = "blob";
   socket.onopen = () => {
     // The server begins anew: what it does not send is gone.
-    for (const map of [nodes, edges, clouds, photos]) map.clear();
+    for (const map of [nodes, edges, clouds, photos, cutOut]) map.clear();
     path = [];
     addToRoom({});
     byId("lost").hidden = true;
