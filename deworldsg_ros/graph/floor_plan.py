@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from deworldsg_ros.graph.extent import horizontal_axes
@@ -79,6 +78,8 @@ def floor_plan(
     Returns:
         None if no view shows anything.
     """
+    import cv2  # slow to import, and only for plans
+
     surface = surface_of(space) if surface is None else surface
     axes = horizontal_axes(up)
     points, _, sides = surface.kept()
@@ -164,6 +165,8 @@ def _fans(
 
 def _occupied(counts: Int64) -> Bool:
     """The occupied cells, by their numbers of points; gaps of a cell in something are closed."""
+    import cv2
+
     sure = counts >= LEAST_POINTS
     beside = cv2.dilate(sure.astype(np.uint8), _BESIDE) > 0
     found = (sure | ((counts > 0) & beside)).astype(np.uint8)

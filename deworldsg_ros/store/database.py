@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import pickle
 import re
 import resource
 import subprocess
@@ -477,8 +476,8 @@ def answer_apart(path: Path, question: str, parameters: Mapping[str, Any]) -> Ro
         StoreError: if it takes more, or cannot be answered.
     """
     try:
-        asked = pickle.dumps((path, question, dict(parameters)))
-    except Exception as error:  # pickle raises any type
+        asked = msgspec.msgpack.encode((str(path), question, dict(parameters)))
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise _refusal(f"a parameter is no plain value: {error}") from error
     ask = f"from {__name__} import answer_asked; answer_asked()"
     paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -495,24 +494,25 @@ def answer_apart(path: Path, question: str, parameters: Mapping[str, Any]) -> Ro
         raise _refusal(f"it takes more than {QUESTION_LIMIT_S:g} s") from error
     if ended.returncode:
         raise _refusal(f"the database ended ({ended.returncode}): ask something simpler")
-    answer = pickle.loads(ended.stdout)
+    answer = msgspec.msgpack.decode(ended.stdout, type=str | Rows)
     if isinstance(answer, str):
         raise StoreError(answer)
-    return Rows(*answer)
+    return answer
 
 
 def answer_asked() -> None:
     """The other side of `answer_apart`."""
-    path, question, parameters = pickle.load(sys.stdin.buffer)
+    path, question, parameters = msgspec.msgpack.decode(sys.stdin.buffer.read())
     try:
-        with opened(path, read_only=True) as database:
+        with opened(Path(path), read_only=True) as database:
             pages = int(Path("/proc/self/statm").read_text().split()[0])
             most = pages * resource.getpagesize() + QUESTION_BYTES
             resource.setrlimit(resource.RLIMIT_AS, (most, most))
             found = database.answer(question, parameters)
-        content = pickle.dumps((found.columns, found.rows))
+        content = msgspec.msgpack.encode(found, enc_hook=str)
     except (StoreError, OSError, RuntimeError, MemoryError) as error:
-        content = pickle.dumps(str(error) or "the question cannot be answered: it takes too much")
+        said = str(error) or "the question cannot be answered: it takes too much"
+        content = msgspec.msgpack.encode(said)
     sys.stdout.buffer.write(content)
 
 

@@ -12,6 +12,7 @@ from unittest.mock import Mock
 import pytest
 from support.cli import printed
 from support.merging import VOCABULARY
+from support.spaces import seen_room
 from support.surfaces import CUP, HERE, view
 
 import deworldsg_ros.client
@@ -19,6 +20,7 @@ from deworldsg_ros.cli import ask
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph.edits import SetLabel
+from deworldsg_ros.graph.provenance import write_space
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import write_map
 
@@ -50,6 +52,7 @@ class FakeClient(nullcontext):
 def page(root_dir, demo_out, monkeypatch):
     """The blocks of the page, with the files that it names and a client without ROS."""
     monkeypatch.setattr(deworldsg_ros.client, "SceneGraphClient", FakeClient, raising=False)
+    write_space(demo_out / "scene_graph.json", seen_room())
     for name in ("monday", "tuesday", "kitchen", "living_room"):
         shutil.copytree(demo_out, demo_out.with_name(name))
     builder = GraphBuilder(Config(), VOCABULARY, "world")

@@ -100,7 +100,7 @@ def test_a_second_start_compiles_nothing():
 def test_a_start_imports_nothing_slow_that_it_may_not_need(modules):
     slow = {"numba", "scipy", "matplotlib", "onnxruntime", "numpy.ma"}
     if "graph_node" in modules:
-        slow |= {"cv2", "sensor_msgs"}
+        slow |= {"cv2"}
     if "cli" in modules:
         slow |= {"deworldsg_ros.pipeline", "rclpy"}
     code = f"import sys, {modules}; print(*({slow} & set(sys.modules)))"
