@@ -3,7 +3,8 @@
 
 python tools/moving_picture.py [OUT.webp]
 
-It runs the shipped recording (about a minute). The picture has at most 1.5 MB.
+It runs the shipped recording, and draws the page in Chromium (three minutes). The picture has at
+most 1.5 MB.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import io
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,10 +24,14 @@ from deworldsg_ros.pipeline import FrameResult, Pipeline
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.scene.arrays import UInt8
 from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.view import picture
+from deworldsg_ros.view import page
 from deworldsg_ros.view.colours import class_colours, to_rgb
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "test"))
+
+from support.browser import browser  # noqa: E402
+
 RECORDING = ROOT / "bags" / "demo_room"
 OUT = ROOT / "docs" / "images" / "growing.webp"
 EVERY, HEIGHT, STEP_MS, LAST_MS = 9, 480, 450, 3000
@@ -60,32 +66,38 @@ def beside(left: UInt8, right: UInt8) -> Image.Image:
 
 def pictures(folder: Path) -> list[Image.Image]:
     """The steps of the moving picture."""
-    steps: list[tuple[UInt8, UInt8]] = []
+    steps: list[tuple[UInt8, Path]] = []
     recording, pipeline = open_recording(RECORDING), Pipeline(Config())
     path: list[np.ndarray] = []
     for index, frame in enumerate(recording.frames()):
         result = pipeline.process(frame)
         path.append(frame.T_world_camera[:3, 3])
-        graph = pipeline.graph()
-        if index % EVERY == EVERY - 1 and graph.nodes:
-            picture.draw(graph, folder / "graph.png", camera_path_world=np.array(path))
-            drawn = cv2.imread(str(folder / "graph.png"), cv2.IMREAD_COLOR)
-            steps.append((seen(frame, result), np.asarray(drawn[:, :, ::-1], np.uint8)))
+        graph, builder = pipeline.graph(), pipeline.builder
+        if index % EVERY == EVERY - 1 and graph.nodes and builder is not None:
+            file = folder / f"{index}.html"
+            page.write(graph, file, camera_path_world=np.array(path), space=builder.space)
+            steps.append((seen(frame, result), file))
     recording.close()
-    # The picture of the graph grows with the graph: all get the size of the last one.
-    height, width = steps[-1][1].shape[:2]
-    return [beside(left, on_canvas(right, height, width)) for left, right in steps]
+    with browser() as opened:
+        # All are seen from where the last one is seen whole.
+        from_there = drawn(opened, steps[-1][1], "[...camera.position, ...controls.target]")[1]
+        place = f"camera.position.set({from_there[:3]}), controls.target.set({from_there[3:]})"
+        place = place.replace("[", "").replace("]", "")
+        shots = [drawn(opened, file, f"{place}, controls.update(), draw()")[0] for _, file in steps]
+    return [beside(left, right) for (left, _), right in zip(steps, shots)]
 
 
-def on_canvas(image: UInt8, height: int, width: int) -> UInt8:
-    """An image, shrunk to fit and centred on its own background."""
-    scale = min(height / image.shape[0], width / image.shape[1], 1.0)
-    size = round(image.shape[1] * scale), round(image.shape[0] * scale)
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    canvas = np.full((height, width, 3), image[0, 0], np.uint8)
-    top, left = (height - size[1]) // 2, (width - size[0]) // 2
-    canvas[top : top + size[1], left : left + size[0]] = small
-    return canvas
+def drawn(opened: Any, file: Path, script: str) -> tuple[UInt8, Any]:
+    """The scene of a page, after a script; and what that returned."""
+    shown = opened.new_page(viewport={"width": 700, "height": 520})
+    shown.goto(file.as_uri())
+    shown.add_style_tag(content="#side, #switches { display: none !important }")
+    shown.wait_for_timeout(1500)
+    value = shown.evaluate(f"({script})")
+    shown.wait_for_timeout(1000)
+    image = np.asarray(Image.open(io.BytesIO(shown.screenshot())).convert("RGB"))
+    shown.close()
+    return image, value
 
 
 def main() -> None:

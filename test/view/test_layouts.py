@@ -17,9 +17,14 @@ def test_rviz_shows_every_namespace_and_receives_the_latched_message(root_dir):
     graph = make_graph([make_node(1, "cup"), make_node(2, "table")], [make_edge(1, 2)])
     assert set(display["Namespaces"]) == {marker.namespace for marker in markers(graph)}
     published = reliable(1, latched=True)
-    for policy in ("durability", "reliability"):
-        name = getattr(published, policy).name.replace("_", " ").title()
-        assert display["Topic"][f"{policy.title()} Policy"] == name
+    rooms = {
+        item["Topic"]["Value"]: item for item in shown if item["Name"] in ("Room", "Floor plan")
+    }
+    assert set(rooms) == {"/scene_graph/points", "/scene_graph/map"}
+    for item in (display, *rooms.values()):
+        for policy in ("durability", "reliability"):
+            name = getattr(published, policy).name.replace("_", " ").title()
+            assert item["Topic"][f"{policy.title()} Policy"] == name
 
 
 def test_foxglove_shows_the_topics_of_the_server_and_of_the_bridge(root_dir):
