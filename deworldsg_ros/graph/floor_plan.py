@@ -14,7 +14,7 @@ import numpy as np
 from deworldsg_ros.graph.extent import horizontal_axes
 from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.graph.surface import Surface, surface_of
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt8, UInt16
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt8
 
 # As in nav_msgs/OccupancyGrid.
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
@@ -29,6 +29,8 @@ LEAST_POINTS = 2
 _BESIDE = np.ones((3, 3), np.uint8)
 # The floor is the lowest layer of this height with this part of the points of the largest one.
 LAYER_M, FLOOR_PART = 0.05, 0.25
+# It is looked for up to so far above the lowest point.
+MOST_RISE_M = 200.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,6 @@ def floor_plan(
     if not len(placed):
         return None
     floor = floor_height_m(placed[:, 2], sides @ axes[2])
-    views = [(*_rays(depth_mm, camera, pose), pose) for depth_mm, _, camera, pose in space.views()]
     cameras = space.poses[:, :3, 3] @ axes.T
     corner = np.minimum(placed[:, :2].min(axis=0), cameras[:, :2].min(axis=0)) - cell_m
     size = np.maximum(placed[:, :2].max(axis=0), cameras[:, :2].max(axis=0)) + cell_m - corner
@@ -95,9 +96,9 @@ def floor_plan(
     columns, rows = (int(count) for count in np.ceil(size / cell_m))
     free: UInt8 = np.zeros((rows, columns), np.uint8)
     band = floor + LOWEST_M, floor + height_m
-    for rays, hits, pose in views:
-        turned, camera = rays @ (axes @ pose[:3, :3]).T, axes @ pose[:3, 3]
-        for fan in _fans(camera, turned, hits, band):
+    for depth_mm, _, intrinsics, pose in space.views():
+        rays = _rays(intrinsics, depth_mm.shape) @ (axes @ pose[:3, :3]).T
+        for fan in _fans(axes @ pose[:3, 3], rays, 1e-3 * depth_mm.astype(np.float64), band):
             cv2.fillPoly(free, [np.floor((fan - corner) / cell_m).astype(np.int32)], 1)
     cells = np.full((rows, columns), UNKNOWN, np.int8)
     cells[free > 0] = FREE
@@ -126,6 +127,7 @@ def floor_height_m(heights: Float32, upward: Float64) -> float:
     """
     above = heights[upward > 0] if (upward > 0).any() else heights
     low = float(above.min())
+    above = above[above - low < MOST_RISE_M]
     layers = np.bincount(((above - low) / LAYER_M).astype(np.int64))
     # A floor may lie on the border of two layers.
     pairs = layers + np.append(layers[1:], 0)
@@ -134,13 +136,12 @@ def floor_height_m(heights: Float32, upward: Float64) -> float:
     return float(np.median(above[inside])) if inside.any() else low
 
 
-def _rays(depth_mm: UInt16, camera: Float64, pose: Float64) -> tuple[Float64, Float64]:
-    """Rays (h, w, 3) through the pixels, camera frame, z = 1; and their depths (h, w), metres."""
-    fx, fy, cx, cy = camera
-    height, width = depth_mm.shape
+def _rays(intrinsics: Float64, shape: tuple[int, ...]) -> Float64:
+    """Rays (h, w, 3) through the pixels of an image, camera frame, z = 1."""
+    fx, fy, cx, cy = intrinsics
+    height, width = shape
     x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
-    rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=2)
-    return rays, 0.001 * depth_mm.astype(np.float64)
+    return np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=2)
 
 
 def _fans(

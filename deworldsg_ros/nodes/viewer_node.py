@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 import msgspec
+from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
@@ -18,7 +19,7 @@ from deworldsg_ros.ros.options import ViewerOptions, ViewerParameters
 from deworldsg_ros.ros.qos import reliable, source
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.streams.images import instances_from_message, rgb_from_message
-from deworldsg_ros.streams.poses import stamp_ns_of
+from deworldsg_ros.streams.poses import pose_from_message, stamp_ns_of
 from deworldsg_ros.view.live.camera import FrameJoiner
 from deworldsg_ros.view.live.sources import Sink, open_sink
 from deworldsg_ros.view.live.state import OnError
@@ -62,6 +63,9 @@ class ViewerNode(StageNode):
         )
         self.create_subscription(
             String, "deworldsg/local_graph", self.guarded(self._local), reliable(10)
+        )
+        self.create_subscription(
+            PoseStamped, "deworldsg/pose_correction", self.guarded(self._correct), reliable(10)
         )
         self.listen(
             "instances",
@@ -117,6 +121,9 @@ class ViewerNode(StageNode):
             wire.ns_from_stamp(stamp),
             lambda: local_graph_from_message(wire.decode(text, wire.LocalGraphMessage)),
         )
+
+    def _correct(self, message: Any) -> None:
+        self._viewer.correct(pose_from_message(message)[0], stamp_ns_of(message))
 
     def _add(self, part: str, stamp_ns: int, decode: Callable[[], Any]) -> None:
         view = self._frames.add(part, stamp_ns, decode, time.monotonic())

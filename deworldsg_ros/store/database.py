@@ -507,7 +507,9 @@ def answer_asked() -> None:
         with opened(Path(path), read_only=True) as database:
             pages = int(Path("/proc/self/statm").read_text().split()[0])
             most = pages * resource.getpagesize() + QUESTION_BYTES
-            resource.setrlimit(resource.RLIMIT_AS, (most, most))
+            hard = resource.getrlimit(resource.RLIMIT_AS)[1]  # a user may have set a smaller one
+            most = most if hard == resource.RLIM_INFINITY else min(most, hard)
+            resource.setrlimit(resource.RLIMIT_AS, (most, hard))
             found = database.answer(question, parameters)
         content = msgspec.msgpack.encode(found, enc_hook=str)
     except (StoreError, OSError, RuntimeError, MemoryError) as error:

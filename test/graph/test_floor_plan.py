@@ -64,6 +64,9 @@ def test_a_large_place_has_wider_cells_and_an_empty_one_no_plan(monkeypatch):
     monkeypatch.setattr("deworldsg_ros.graph.floor_plan.MOST_CELLS", 20)
     plan = floor_plan(seen_room(), UP, 1.5)
     assert max(plan.cells.shape) <= 21 and plan.cell_m > 0.19
+    space = seen_room()
+    space.poses[0, 2, 3] = -1e8  # of a damaged file
+    assert floor_plan(space, UP, 1.5) is not None
     space = SeenSpace()
     assert floor_plan(space, UP, 1.5) is None
     add_view(space, looking((0, 0, 1.2), 0.0), 1)

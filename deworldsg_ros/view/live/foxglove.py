@@ -106,6 +106,9 @@ class FoxgloveServer(foxglove.ServerListener):
     def see(self, space: SeenSpace) -> None:
         """Do nothing: Foxglove shows the graph and the camera."""
 
+    def correct(self, T_correction: Float64, since_ns: int) -> None:
+        """Do nothing, as `see`."""
+
     def look(self, view: CameraView) -> None:
         """Send a frame of the camera: the image with its masks, and its pose."""
         with self._lock:

@@ -231,6 +231,21 @@ class LiveState:
         for view in space.views():
             self._add(*view)
 
+    def correct(self, T_correction: Float64, since_ns: int) -> None:
+        """Apply a correction (4, 4) of the poses since a stamp to the room and the camera's way."""
+        self._places = [
+            (stamp_ns, T_correction[:3, :3] @ place + T_correction[:3, 3])
+            if stamp_ns >= since_ns
+            else (stamp_ns, place)
+            for stamp_ns, place in self._places
+        ]
+        self._redrawn += 1
+        self._points.clear()  # frames bring them again
+        self._space.move(T_correction, since_ns)
+        self._surface.clear()
+        self._surface_gone = []
+        self.see(self._space)
+
     def _add(self, depth_mm: UInt16, rgb: UInt8, camera: Float64, pose: Float64) -> None:
         begun, gone = self._surface.begun, self._surface.gone.copy()
         self._surface.add(depth_mm, rgb, camera, pose)

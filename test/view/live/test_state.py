@@ -283,6 +283,30 @@ def test_the_room_is_sent_once_and_what_went_is_told():
     assert page.surface == {"from": 0, "gone": []}
 
 
+def test_a_correction_moves_the_room_and_the_way_since_its_stamp():
+    state = LiveState()
+    page, nothing = Page(state), (np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4)))
+    rgb = np.zeros((480, 640, 3), np.uint8)
+    for stamp_ns, x in ((1, 0.0), (2, 10.0)):
+        T = np.eye(4)
+        T[0, 3] = x
+        local = local_graph(stamp_ns, *nothing, depth_grid=grid_of(2.0), T_world_camera=T)
+        state.look(CameraView(stamp_ns, T, rgb, local=local))
+    page.look()
+    T_correction = np.eye(4)
+    T_correction[1, 3] = 1.0
+    state.correct(T_correction, 2)
+    page.look()
+    assert page.path == [[0, 0, 0], [10, 1, 0]]
+    surface = page.surface
+    assert surface["from"] == 0
+    steps = np.frombuffer(base64.b64decode(surface["steps"]), "<i2").reshape(-1, 3)
+    places = np.array(surface["origin"]) + surface["step"] * steps
+    moved = places[:, 0] > 5
+    assert moved.sum() == 4800 == (~moved).sum()
+    assert places[moved, 1].mean() - places[~moved, 1].mean() == pytest.approx(1.0, abs=0.01)
+
+
 def test_a_relation_is_explained():
     state = LiveState()
     state.reset(make_graph([node(1), node(2, "table")], [make_edge(1, 2)]))
