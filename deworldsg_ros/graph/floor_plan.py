@@ -19,7 +19,7 @@ from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt
 # As in nav_msgs/OccupancyGrid.
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 CELL_M = 0.05
-# A plan has at most so many cells a side: 100 m. Those of larger places are wider.
+# Cells along one side of a plan: 100 m of `CELL_M`. A larger place has wider cells.
 MOST_CELLS = 2000
 # What is lower is floor: thresholds, carpets, and the error of the depth.
 LOWEST_M = 0.1

@@ -22,7 +22,8 @@ MOST_POINTS = 150_000
 # A pixel is left out if fewer than two of its four neighbours have about its depth: it lies on an
 # edge, between two surfaces.
 LEAST_ALIKE, ALIKE_M, ALIKE_FRACTION = 2, 0.03, 0.05
-# A point goes when as many views see through it as saw it. At most so many that saw it count.
+# Each view that sees a point adds a vote, up to this number; each that sees through it takes one
+# away. A point without votes goes.
 MOST_VOTES = 4
 # A point belongs to an object up to so far outside of its box: the error of both.
 BOX_MARGIN_M = 0.02

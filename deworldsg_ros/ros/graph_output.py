@@ -275,7 +275,7 @@ class _Room(NamedTuple):
     space: SeenSpace
     snapshot: wire.SceneGraphMessage
     points: bool
-    height_m: float  # 0 = nobody wants the plan
+    height_m: float  # of the robot; 0 = the plan has no subscriber
 
 
 class RoomTopics:

@@ -226,7 +226,7 @@ class SqliteFile(Sqlite3Reader):
 
 
 class _RecordsOf:
-    """An open file of which one record is read at a time: its length may claim anything."""
+    """An open file that refuses to read more than `MAX_CHUNK_BYTES`, whatever a record claims."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file

@@ -150,9 +150,7 @@ def _read_index(path: Path, value_count: int) -> list[Entry]:
             if value_count > 1:
                 [float(word) for word in words[1:]]
         except ValueError as error:
-            raise RecordingError(
-                f"{path}, line {number}: '{line[:80]}': expected numbers"
-            ) from error
+            raise RecordingError(f"{where}: expected numbers") from error
         if len(words) <= value_count:
             raise RecordingError(
                 f"{where} has {len(words) - 1} values after the stamp: expected {value_count}"

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import GraphReplica
 
-# A block has a snapshot and at most so many updates. To make a moment, they are applied in turn.
+# Moments of a block: its snapshot, and the updates after it, which are applied in turn.
 BLOCK = 100
 # The oldest moments are forgotten beyond so many bytes, packed: minutes of a busy room at 30 Hz,
 # hours of a quiet one.
