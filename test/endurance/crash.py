@@ -42,7 +42,8 @@ def kill_and_restart(rig: Rig, name: str) -> Recovery:
     rig.kill(name)
     kept: set[int] = set()
     if name == "graph_node":
-        kept, rig.graph = kept_ids(rig), None
+        kept = rig.kept = kept_ids(rig)
+        rig.graph = None
     started_s = time.monotonic()
     rig.start(name)
     process = rig.processes[name]
@@ -57,15 +58,15 @@ def kill_and_restart(rig: Rig, name: str) -> Recovery:
         # A node can be merged into another, or be seen to be gone, before the first whole graph.
         if len(lost) > 0.1 * len(kept):
             problem = f"ids {lost} of {len(kept)} are lost"
-        if again := given_again(rig, kept):
+        if again := given_again(rig):
             problem = f"ids {sorted(again)} are given again"
     return Recovery(name, ready_s - started_s, time.monotonic() - ready_s, problem)
 
 
-def given_again(rig: Rig, kept: set[int]) -> set[int]:
-    """Ids of the newest session that one before had published, and that no checkpoint has kept."""
+def given_again(rig: Rig) -> set[int]:
+    """Ids of the newest session that one before had published, and that its map did not have."""
     *before, newest = rig.published.values()
-    return newest & set().union(*before) - kept
+    return newest & set().union(*before) - rig.kept
 
 
 def kept_ids(rig: Rig) -> set[int]:

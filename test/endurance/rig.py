@@ -53,6 +53,7 @@ class Rig:
         self.graph: wire.SceneGraphMessage | None = None  # the newest whole one
         self.updates = 0
         self.published: dict[str, set[int]] = {}  # ids of each session, in updates
+        self.kept: set[int] = set()  # ids of the map with which the newest session began
         self.values: dict[str, dict[str, str]] = {}  # newest diagnostics of each node
         self._graph_texts = self.peer.collect("/scene_graph", 1, latched=True)
         self._update_texts = self.peer.collect("/scene_graph/updates")
