@@ -164,21 +164,16 @@ def test_an_object_is_cut_out_of_the_room_and_stands_out_when_chosen(chromium, t
     with opened_page(chromium, path.as_uri()) as shown:
         until(shown, f"layers.room.visible && {count} > 1000", "the room")
         rows = shown.evaluate(count)
-        shown.evaluate(
+        look = (
             "camera.position.set(-1.5, -0.2, 1.4), controls.target.set(0.8, 0, 0.4), "
-            "hiddenKinds.add('boxes').add('labels'), controls.update(), draw('choice')"
+            "controls.update(), draw('choice')"
         )
+        shown.evaluate(f"hiddenKinds.add('boxes').add('labels'), {look}")
         before = reds(shown)
         assert before > 0.02
-        shown.evaluate(
-            "choose(8), camera.position.set(-1.5, -0.2, 1.4), "
-            "controls.target.set(0.8, 0, 0.4), controls.update(), draw()"
-        )
+        shown.evaluate(f"choose(8), {look}")
         assert reds(shown) < 0.3 * before  # it steps back with the room
-        shown.evaluate(
-            "choose(7), camera.position.set(-1.5, -0.2, 1.4), "
-            "controls.target.set(0.8, 0, 0.4), controls.update(), draw()"
-        )
+        shown.evaluate(f"choose(7), {look}")
         assert reds(shown) > 0.8 * before  # and stays as it is when it is the chosen one
         shown.locator("#card a", has_text="cut it out").click()
         until(shown, f"{count} < {rows} - 100", "a room without the block")
