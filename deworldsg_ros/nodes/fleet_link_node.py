@@ -114,6 +114,9 @@ class FleetLinkNode(StageNode):
         follower = self._link.follower
         changed = follower.ask(self.parameters.node.period_s + 1.0)
         self._is_connected = changed is not None
+        if follower.others:
+            follower.others = 0
+            self.drop("same_name", "two fleet_nodes answer: the first one is followed; end one")
         if changed:
             self._others.publish(follower.replica.message())
             self.health.published()

@@ -322,8 +322,8 @@ REASONS: dict[str, str] = {
     "keys of `deworldsg/robots` on the Zenoh network.",
     "too_many_robots": "256 robots are in the fleet, and a new one is ignored. Look for a robot "
     "that has several names at once.",
-    "same_name": "Two robots of the fleet have one name, and the fleet follows the first one. Give "
-    "each fleet_link_node another `robot`.",
+    "same_name": "Two robots of the fleet have one name, or two fleet_nodes answer; the first one "
+    "is followed. Give each fleet_link_node another `robot`, and run one fleet_node.",
     "message_too_large": "A JSON message is larger than 16 MiB, or 256 MiB for the global graph, "
     "or 64 MiB for that of a robot of a fleet. "
     "Look for a second publisher on its topic.",
