@@ -372,6 +372,8 @@ class Store:
     def ask(self, cypher: str, parameters: Mapping[str, Any] | None = None) -> Rows:
         """Answer a question in Cypher; it cannot change the database, nor use other files.
 
+        Each question has a process of its own, which takes most of a second to start.
+
         Args:
             cypher: with the tables Object, Relation and Stay (docs/store.md).
             parameters: values of its ``$names``.
