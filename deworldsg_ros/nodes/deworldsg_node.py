@@ -44,6 +44,7 @@ class DeworldsgNode(PerceivingNode):
         perceived = self.perceive(frame)
         local = self._lifting.lift_frame(perceived.frame_graph, perceived.instances, frame)
         self.health.left_out(local.drops)
+        self.finish()
         self.graph.submit(lambda: self.graph.integrate(local))
         self._relating.relate(PairingFrame(local, frame.rgb))
 

@@ -31,6 +31,7 @@ class SegmentationNode(PerceivingNode):
         image.header.frame_id = perceived.frame_graph.frame_id
         set_stamp(image, frame.stamp_ns)
         fill_image(image, perceived.instances, "mono16")
+        self.finish()
         self._instances.publish(image)
         self._publish_graph(frame_graph_to_message(perceived.frame_graph))
 

@@ -93,6 +93,11 @@ class JoiningNode(StageNode, Generic[Out]):
         # The maximum wait also ends when no message arrives.
         self.every(CHECK_PERIOD_S, self.pump)
 
+    def finish(self) -> None:
+        """As `Worker.finish`: call it in `work`, before the product of a frame is published."""
+        assert self._worker is not None
+        self._worker.finish()
+
     def taking(self, add: Callable[..., None]) -> Callable[..., None]:
         """A callback that adds a message to the assembler and passes on complete frames."""
 

@@ -26,6 +26,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as rcl
 from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from std_msgs.msg import String
@@ -56,21 +57,37 @@ from deworldsg_ros.wire import messages as wire
 MAX_PASSES = 10
 
 
-def take_waiting(node: Node) -> None:
+def take_waiting(node: StageNode) -> None:
     """Take all messages that are wanted now, at most `MAX_PASSES` of each topic."""
     for _ in range(MAX_PASSES):
         taken = 0
         for subscription in list(node.subscriptions):
+            # DDS drops a text that it cannot decode, and says nothing.
+            is_text = subscription.msg_type is String
             with subscription.handle:
                 if not subscription.callback_group.can_execute(subscription):
                     continue
-                message = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-            if message is not None:
-                taken += 1
+                message = subscription.handle.take_message(subscription.msg_type, is_text)
+            if message is None:
+                continue
+            taken += 1
+            with node.refusing():
+                if is_text:
+                    message = (_text_of(message[0], subscription.topic_name), message[1])
                 has_info = subscription._callback_type is not Subscription.CallbackType.MessageOnly
                 subscription.callback(*message if has_info else message[:1])
         if not taken:
             return
+
+
+def _text_of(serialized: bytes, topic: str) -> String:
+    try:
+        return deserialize_message(serialized, String)
+    except Exception as error:  # the class of rclpy's error is not public
+        raise RefusedInput(
+            "invalid_message",
+            f"{topic}: {len(serialized)} bytes are no std_msgs/String: {error}",
+        ) from error
 
 
 class Waiting:

@@ -131,6 +131,7 @@ class Worker(Generic[T]):
         self._after = after
         self._max_busy_s = max_busy_s
         self._rested_s = time.monotonic()  # the end of the last pause
+        self._finished_s = math.inf
         self._items: deque[tuple[T, float]] = deque()  # with the time of `submit`
         self._changed = threading.Condition()
         self._stopping = False
@@ -153,6 +154,14 @@ class Worker(Generic[T]):
             self._changed.notify_all()
         for oldest in lost:
             self._on_overrun(oldest)
+
+    def finish(self) -> None:
+        """Note, inside `work`, that the result of the item goes out now.
+
+        Items that come later drop no other ones: whoever waits for results before it sends more
+        loses none, whenever the thread goes on.
+        """
+        self._finished_s = time.monotonic()
 
     def youngest_s(self) -> float:
         """When the newest waiting item was submitted, monotonic clock; 0 = none waits."""
@@ -188,6 +197,7 @@ class Worker(Generic[T]):
                 self._busy = True
             for item in late:
                 self._on_overrun(item)
+            self._finished_s = math.inf
             for item in items:
                 self._work(item)
             wait_s = self._after()
@@ -198,6 +208,6 @@ class Worker(Generic[T]):
         """The waiting items that are dropped, and the next one."""
         late = []
         if time.monotonic() - self._rested_s > self._max_busy_s:
-            while len(self._items) > 1:
+            while len(self._items) > 1 and self._items[1][1] <= self._finished_s:
                 late.append(self._items.popleft()[0])
         return late, [self._items.popleft()[0]] if self._items else []

@@ -1,5 +1,6 @@
 """A node adapts to the publishers: best effort, compressed images, odometry, TF, later changes."""
 
+import time
 from functools import partial
 from typing import Any
 
@@ -8,14 +9,18 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from support.nodes import peer
+from std_msgs.msg import String
+from support.nodes import peer, wait_until
 from support.nodes_bench import (
     CAMERA,
     LIMIT_S,
     Bench,
     alone,
     camera_info,
+    local_graph,
     pose,
     stamped,
     works,
@@ -23,10 +28,13 @@ from support.nodes_bench import (
 from support.recordings import encoded
 from support.streams import compressed_depth
 
+from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
 from deworldsg_ros.ros import inputs
+from deworldsg_ros.ros.node import Waiting, serve
 from deworldsg_ros.ros.qos import AutoSubscription, best_effort, reliable, source
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.wire import messages as wire
 
 
 def compressed_rgb(stamp_ns: int) -> CompressedImage:
@@ -148,3 +156,27 @@ def test_tf_is_used_for_odometry_of_another_frame(any_tf, child):
         at.expect(lambda: at.node._frames._had_poses, "the odometry")
         at.peer.spin_for(0.2)
         assert listens_to_tf(at) is (child == "base_link")
+
+
+def test_a_text_that_cannot_be_decoded_is_counted_and_its_topic_named(caplog):
+    """DDS itself drops such a text, and says nothing."""
+    topic = "deworldsg/local_graph"
+    first, whole = (
+        serialize_message(String(data=wire.encode(local_graph(second * 10**9))))
+        for second in (1, 2)
+    )
+    with peer("sender") as sender, alone(GraphNode) as node:
+        executor = SingleThreadedExecutor(context=node.context)
+        executor.add_node(node)
+        waiting = Waiting(node, executor)
+        publisher = sender.node.create_publisher(String, topic, reliable(10))
+
+        def reaches(second, step):
+            wait_until(lambda: node.graph.newest_ns == second * 10**9, LIMIT_S, topic, step)
+
+        reaches(1, lambda: (publisher.publish(first), time.sleep(0.2), serve(node, waiting)))
+        for text in (whole[:40], b"", whole[:4] + b"\xff" * 4 + whole[8:], whole):
+            publisher.publish(text)
+        reaches(2, partial(serve, node, waiting))
+        assert node.health.drops["invalid_message"] == 3
+        executor.shutdown()

@@ -151,3 +151,22 @@ def test_the_mean_rate_of_what_is_published_is_limited():
         times.changed(now_s, now_s)
         assert times.wait_s(now_s) == 0.0
         times.taken()
+
+
+def test_what_comes_after_a_result_drops_nothing():
+    """A replay sends the next frame on a result, maybe before the thread that gave it goes on."""
+    done, overruns = [], []
+
+    def work(item):
+        if item == 0:
+            worker.submit(1)  # a camera does not wait
+            worker.submit(2)
+            worker.finish()
+            worker.submit(3)
+        done.append(item)
+
+    worker = Worker("test", work, size=9, on_overrun=overruns.append, max_busy_s=0.0)
+    worker.submit(0)
+    assert worker.wait_idle(LIMIT_S)
+    assert (done, overruns) == ([0, 2, 3], [1])
+    assert worker.stop(LIMIT_S)
