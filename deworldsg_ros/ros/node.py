@@ -90,17 +90,24 @@ def _text_of(serialized: bytes, topic: str) -> String:
         ) from error
 
 
+class _TimersAndServices(SingleThreadedExecutor):
+    """Takes no messages: those are for `take_waiting`."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return not isinstance(entity, Subscription) and bool(super().can_execute(entity))
+
+
 class Waiting:
     """Waits until a node has something to do.
 
     Args:
         node: its callbacks run in the thread that waits.
-        executor: serves the timers and services of the node.
     """
 
-    def __init__(self, node: Node, executor: SingleThreadedExecutor) -> None:
+    def __init__(self, node: StageNode) -> None:
         self._node = node
-        self._executor = executor
+        self._executor = _TimersAndServices(context=node.context)
+        self._executor.add_node(node)
         self._sizes: tuple[int, ...] = ()
         self._set: Any = None
 
@@ -138,6 +145,10 @@ class Waiting:
             # One call serves one of them, and each request that still waits for its answer is one.
             for _ in range(1 + len(self._executor._tasks)):
                 self._executor.spin_once(timeout_sec=0)
+
+    def close(self) -> None:
+        """Serve nothing more."""
+        self._executor.shutdown(timeout_sec=1.0)
 
 
 # --- What a node says about itself: the message of /diagnostics, and log lines of drops.
@@ -577,9 +588,7 @@ def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> in
         gc.collect()
         gc.freeze()
         try:
-            executor = SingleThreadedExecutor()
-            executor.add_node(node)
-            waiting = Waiting(node, executor)
+            waiting = Waiting(node)
             for override in node.unused_overrides():
                 node.get_logger().warning(f"{override} has no effect: there is no such topic yet")
             if is_respawned:
@@ -590,7 +599,7 @@ def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> in
                 hung = node.hung() if is_respawned else ""
             if hung:
                 node.diagnose()
-            executor.shutdown(timeout_sec=1.0)
+            waiting.close()
         finally:
             faulthandler.cancel_dump_traceback_later()
             node.close()

@@ -9,7 +9,6 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
@@ -166,9 +165,7 @@ def test_a_text_that_cannot_be_decoded_is_counted_and_its_topic_named(caplog):
         for second in (1, 2)
     )
     with peer("sender") as sender, alone(GraphNode) as node:
-        executor = SingleThreadedExecutor(context=node.context)
-        executor.add_node(node)
-        waiting = Waiting(node, executor)
+        waiting = Waiting(node)
         publisher = sender.node.create_publisher(String, topic, reliable(10))
 
         def reaches(second, step):
@@ -179,4 +176,4 @@ def test_a_text_that_cannot_be_decoded_is_counted_and_its_topic_named(caplog):
             publisher.publish(text)
         reaches(2, partial(serve, node, waiting))
         assert node.health.drops["invalid_message"] == 3
-        executor.shutdown()
+        waiting.close()
