@@ -60,6 +60,8 @@ const visibleEdges = () => {
 
 const view = byId("view");
 const renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
+// A test sees a shader that fails by its pixels; the check waits for each one before the next.
+renderer.debug.checkShaderErrors = false;
 const scene = new THREE.Scene();
 const camera = new THREE.PerspectiveCamera(50, 1, 0.05, 1000);
 camera.up.set(0, 0, 1);
@@ -112,8 +114,14 @@ layers.room.renderOrder = -1;
 scene.add(layers.room);
 
 function bytesOf(text) {
-  return Uint8Array.from(atob(text), character => character.charCodeAt(0));
+  const characters = atob(text), bytes = new Uint8Array(characters.length);
+  for (let at = 0; at < bytes.length; at++) bytes[at] = characters.charCodeAt(at);
+  return bytes;
 }
+
+// Linear light of the 256 steps of sRGB.
+const LINEAR = Float32Array.from({ length: 256 }, (_, step) =>
+  new THREE.Color().setRGB(step / 255, 0, 0, "srgb").r);
 
 function addToRoom({ from = 0, gone = [], origin, step, cell, steps, rgb, sides: seen }) {
   const start = 3 * from, more = steps ? new Int16Array(bytesOf(steps).buffer) : [];
@@ -123,11 +131,9 @@ function addToRoom({ from = 0, gone = [], origin, step, cell, steps, rgb, sides:
   colours.set(room.colours.subarray(0, start));
   sides.set(room.sides.subarray(0, start));
   if (steps) sides.set(new Int8Array(bytesOf(seen).buffer), start);
-  const bytes = steps ? bytesOf(rgb) : [], linear = new THREE.Color();
+  const bytes = steps ? bytesOf(rgb) : [];
   for (let at = 0; at < more.length; at++) places[start + at] = origin[at % 3] + step * more[at];
-  for (let at = 0; at < bytes.length; at += 3)
-    linear.setRGB(bytes[at] / 255, bytes[at + 1] / 255, bytes[at + 2] / 255, "srgb")
-      .toArray(colours, start + at);
+  for (let at = 0; at < bytes.length; at++) colours[start + at] = LINEAR[bytes[at]];
   if (from === 0) room.gone.clear();
   for (const row of gone) room.gone.add(row);
   Object.assign(room, { places, colours, sides, cell: cell ?? room.cell });
@@ -421,11 +427,13 @@ function recolour() {
 
 const labels = byId("labels");
 const taken = [];
+// Of the view, pixels: to ask for them between two labels would arrange the page anew each time.
+let viewWidth = 1, viewHeight = 1;
 
 function put(text, place, className, colour) {
   const at = place.clone().project(camera);
   if (at.z > 1 || Math.abs(at.x) > 1.1 || Math.abs(at.y) > 1.1) return;
-  const x = (at.x + 1) / 2 * view.clientWidth, y = (1 - at.y) / 2 * view.clientHeight;
+  const x = (at.x + 1) / 2 * viewWidth, y = (1 - at.y) / 2 * viewHeight;
   // About 6.6 pixels a character: measuring each text would take longer than drawing it.
   const width = 6.6 * text.length + 4, height = 15;
   const box = [x - width / 2, y - height / 2, x + width / 2, y + height / 2];
@@ -443,6 +451,7 @@ function put(text, place, className, colour) {
 const top_ = node => new THREE.Vector3(...node.centre).setZ(node.centre[2] + node.size[2] / 2);
 
 function drawLabels() {
+  [viewWidth, viewHeight] = [view.clientWidth, view.clientHeight];
   labels.replaceChildren();
   taken.length = 0;
   if (hiddenKinds.has("labels")) return;
@@ -805,8 +814,7 @@ function apply(message) {
 }
 
 function pointsOf({ from, mm }) {
-  const bytes = Uint8Array.from(atob(mm), character => character.charCodeAt(0));
-  const steps = new Int16Array(bytes.buffer), points = new Float32Array(steps.length);
+  const steps = new Int16Array(bytesOf(mm).buffer), points = new Float32Array(steps.length);
   for (let at = 0; at < steps.length; at++) points[at] = from[at % 3] + steps[at] / 1000;
   return points;
 }
