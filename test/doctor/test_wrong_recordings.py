@@ -90,7 +90,7 @@ def test_the_doctor_names_what_is_wrong_first(what, frames, folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("name", ["office", pytest.param("kitchen", marks=pytest.mark.nightly)])
 def test_the_same_of_real_recordings(name, shared_dir, folder):
     frames = frames_of(shared_dir / REAL[name], NUMBER)
     missed = set()

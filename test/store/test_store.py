@@ -59,13 +59,15 @@ def written(folder: Path, *messages) -> Store:
 
 def content(store: Store) -> tuple[list[list[object]], list[list[object]]]:
     """Objects and relations of a database."""
-    objects = store.ask(
-        "MATCH (o:Object) RETURN o.id, o.label, o.probability, o.x, o.observations ORDER BY o.id"
-    )
-    relations = store.ask(
-        "MATCH (a:Object)-[r:Relation]->(b:Object) RETURN a.id, b.id, r.predicate, r.probability "
-        "ORDER BY a.id, b.id"
-    )
+    with store.opened() as database:  # `ask` starts a process for each question
+        objects = database.answer(
+            "MATCH (o:Object) RETURN o.id, o.label, o.probability, o.x, o.observations "
+            "ORDER BY o.id"
+        )
+        relations = database.answer(
+            "MATCH (a:Object)-[r:Relation]->(b:Object) RETURN a.id, b.id, r.predicate, "
+            "r.probability ORDER BY a.id, b.id"
+        )
     return objects.rows, relations.rows
 
 
