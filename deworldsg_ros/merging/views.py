@@ -23,6 +23,9 @@ from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 # the step of the depth grid at an edge.
 THROUGH_M = 0.08
 THROUGH_FRACTION = 0.03
+# A node is seen through only in so many different cells of the depth grid, as of three by three.
+# The grid samples the image: what is small and far, as a cup 3 m away, may lie between its cells.
+MIN_THROUGH_CELLS = 9
 # A node is judged only if this many of its points are visible, and this fraction of them.
 MIN_VISIBLE_POINTS = 6
 MIN_VISIBLE_FRACTION = 0.5
@@ -124,13 +127,15 @@ def _see(
         object_of[value] = -1
     for index in range(len(values)):
         object_of[values[index]] = index
-    hits = np.empty(len(values), np.int64)
+    hits, cells = np.empty(len(values), np.int64), np.empty(SAMPLED_POINTS, np.int64)
     for column in range(len(slots)):
         count = min(counts[slots[column]], SAMPLED_POINTS)
         visibilities[column] = NOT_VISIBLE
         for index in range(len(values)):
             hits[index], covered[index, column] = 0, np.nan
-        behind, present, inside = _compare(points[slots[column]], count, object_of, hits, frame)
+        behind, present, inside = _compare(
+            points[slots[column]], count, object_of, hits, cells, frame
+        )
         if present >= MIN_VISIBLE_POINTS:
             for index in range(len(values)):
                 covered[index, column] = hits[index] / present
@@ -142,15 +147,27 @@ def _see(
             visibilities[column] = QUARTER
             if half:
                 visibilities[column] = FULL if inside >= FULL_VIEW_FRACTION * count else HALF
-        through[column] = half and behind >= DECISIVE_FRACTION * visible
+        if half and behind >= DECISIVE_FRACTION * visible:
+            different = 0
+            for index in range(behind):
+                different += not (cells[:index] == cells[index]).any()
+            through[column] = different >= MIN_THROUGH_CELLS
     return visibilities, through, covered
 
 
 @kernel
 def _compare(
-    points: Float32, count: int, object_of: Int64, hits: Int64, frame: FrameArrays
+    points: Float32,
+    count: int,
+    object_of: Int64,
+    hits: Int64,
+    cells: Int64,
+    frame: FrameArrays,
 ) -> tuple[int, int, int]:
-    """Number of points that are seen through, present, and in the image; counts those in masks."""
+    """Number of points that are seen through, present, and in the image.
+
+    Counts those in masks, and notes the cells of the depth grid that are seen through.
+    """
     T, depth_mm, instances, (fx, fy, cx, cy) = frame
     height, width = depth_mm.shape
     behind = present = inside = 0
@@ -171,6 +188,7 @@ def _compare(
             continue
         tolerance_m = THROUGH_M + THROUGH_FRACTION * ahead
         if measured_m > ahead + tolerance_m:
+            cells[behind] = int(v) * width + int(u)
             behind += 1
         elif measured_m > ahead - tolerance_m:
             present += 1

@@ -84,6 +84,13 @@ def test_a_node_is_seen_through_if_half_of_it_is_in_the_image(seed: int) -> None
     assert through == bool(inside.sum() >= 20)
 
 
+@pytest.mark.parametrize(("z_m", "through"), [(0.6, True), (1.2, True), (3.0, False)])
+def test_what_the_depth_grid_does_not_resolve_is_not_seen_through(z_m, through) -> None:
+    """Its cells may lie beside a bottle far away, which is there all the same."""
+    points = slab((0, 0, z_m), (0.1, 0.25, 0.1))
+    assert view_of(points[: views.SAMPLED_POINTS], background_m=8.0)[0] == through
+
+
 def halves() -> DepthGrid:
     """A wall at 1 m, its left half in the first mask and its right half in the second."""
     instances = np.repeat(np.uint16([[1, 2]]), 40, axis=1).repeat(60, axis=0)
