@@ -139,7 +139,7 @@ def test_a_node_that_does_not_keep_up_goes_on_with_the_newest_image(whole, monke
         return decode(message)
 
     monkeypatch.setattr(frames, "rgb_from_message", note)
-    waiting = Waiting(whole.node, whole.executor)
+    waiting = Waiting(whole.node)
     whole.peer.also_spin.clear()
     worker = whole.node._worker
 
@@ -162,3 +162,4 @@ def test_a_node_that_does_not_keep_up_goes_on_with_the_newest_image(whole, monke
         assert begun[1] == whole.stamp_ns
         assert begun == decoded
         assert whole.node.health.drops == {"overrun": 2}
+    waiting.close()
