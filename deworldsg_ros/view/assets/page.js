@@ -182,7 +182,8 @@ function drawRoom() {
   shape.setAttribute("position", new THREE.Float32BufferAttribute(kept(room.places), 3));
   shape.setAttribute("color", new THREE.Float32BufferAttribute(kept(room.colours), 3));
   shape.setAttribute("side", new THREE.Float32BufferAttribute(sides, 3));
-  layers.room.material.size = 1.4 * room.cell;
+  // three.js takes the size as that of a view of 90 degrees.
+  layers.room.material.size = 1.2 * room.cell / Math.tan(camera.fov * Math.PI / 360);
   layers.room.geometry.dispose();
   layers.room.geometry = shape;
   if (!hasChosenPoints && room.places.length) {
