@@ -23,8 +23,9 @@ from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 # the step of the depth grid at an edge.
 THROUGH_M = 0.08
 THROUGH_FRACTION = 0.03
-# A node is seen through only in so many different cells of the depth grid, as of three by three.
-# The grid samples the image: what is small and far, as a cup 3 m away, may lie between its cells.
+# A node counts as seen through only if its points fall into at least this many cells of the depth
+# grid (3 x 3). The grid holds every 8th pixel, so a small object far away, such as a cup at 3 m, can
+# lie between the pixels that it holds.
 MIN_THROUGH_CELLS = 9
 # A node is judged only if this many of its points are visible, and this fraction of them.
 MIN_VISIBLE_POINTS = 6

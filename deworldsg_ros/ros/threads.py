@@ -156,10 +156,10 @@ class Worker(Generic[T]):
             self._on_overrun(oldest)
 
     def finish(self) -> None:
-        """Note, inside `work`, that the result of the item goes out now.
+        """Call this inside `work`, just before the result of the item is published.
 
-        Items that come later drop no other ones: whoever waits for results before it sends more
-        loses none, whenever the thread goes on.
+        Items that are submitted after it do not make waiting items late. A replay sends its next
+        frame when it gets a result, perhaps before this thread runs again; no frame is lost then.
         """
         self._finished_s = time.monotonic()
 

@@ -60,7 +60,8 @@ const visibleEdges = () => {
 
 const view = byId("view");
 const renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
-// A test sees a shader that fails by its pixels; the check waits for each one before the next.
+// This check waits for each shader, so that they are compiled one after another. Tests look at the
+// pixels instead.
 renderer.debug.checkShaderErrors = false;
 const scene = new THREE.Scene();
 const camera = new THREE.PerspectiveCamera(50, 1, 0.05, 1000);
