@@ -24,8 +24,8 @@ from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 THROUGH_M = 0.08
 THROUGH_FRACTION = 0.03
 # A node counts as seen through only if its points fall into at least this many cells of the depth
-# grid (3 x 3). The grid holds every 8th pixel, so a small object far away, such as a cup at 3 m, can
-# lie between the pixels that it holds.
+# grid (3 x 3). The grid holds every 8th pixel, so a small object far away, such as a cup at 3 m,
+# can lie between the pixels that it holds.
 MIN_THROUGH_CELLS = 9
 # A node is judged only if this many of its points are visible, and this fraction of them.
 MIN_VISIBLE_POINTS = 6
