@@ -9,13 +9,14 @@ from collections import Counter
 from typing import Any
 
 from deworldsg_ros.config import Config, MergingConfig
-from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.edits import GraphEdit, NameRoom
 from deworldsg_ros.graph.extent import NodeBoxes
 from deworldsg_ros.graph.graph import GlobalGraph, nodes_since
 from deworldsg_ros.graph.messages import hidden_node
 from deworldsg_ros.graph.pairs import frame_votes
 from deworldsg_ros.graph.provenance import FrameMemory, SeenSpace
 from deworldsg_ros.graph.publication import Publication
+from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.poses.drift import Drift
@@ -47,6 +48,7 @@ class GraphBuilder:
         merging: the association rule.
         frames: from which frames the nodes and edges come.
         space: the space that the camera has seen as free.
+        rooms: the rooms of that space, as of the last `find_rooms` or `set_rooms`.
         prior: of class pairs.
         refused: what was left out of the newest frame, in words, by reason.
     """
@@ -80,7 +82,7 @@ class GraphBuilder:
             min_name=output.min_name,
             include_surface_points=output.include_surface_points,
         )
-        self.frames, self.space = FrameMemory(), SeenSpace()
+        self.frames, self.space, self.rooms = FrameMemory(), SeenSpace(), RoomMap()
         self._newest_ns: int | None = None
         self.refused: dict[str, str] = {}
 
@@ -156,7 +158,7 @@ class GraphBuilder:
         except RefusedInput as refusal:
             self.refused[refusal.reason] = str(refusal)
 
-    def edit(self, request: EditRequest) -> EditReply:
+    def edit(self, request: GraphEdit) -> EditReply:
         """Make an operator's edit, or undo the newest one.
 
         The next `update` contains what it changes.
@@ -164,11 +166,32 @@ class GraphBuilder:
         Raises:
             RefusedInput: ``invalid_request``, with the reason; nothing is changed then.
         """
+        if isinstance(request, NameRoom):
+            rooms = self.rooms.named(request.room, request.name)
+            self.set_rooms(rooms, rooms.states(self.snapshot().nodes))
+            said = f"is called {request.name}" if request.name else "is called by what it contains"
+            return EditReply("name_room", [], f"room {request.room} {said}")
         reply = self.merging.edit(self.graph, request, self.newest_ns)
         for node_id in reply.nodes:
             for old_id in self.graph.edits.origins(node_id):
                 self.frames.copy(old_id, node_id)
         return reply
+
+    @property
+    def has_rooms(self) -> bool:
+        """Whether rooms are looked for: the paper has none."""
+        return self._drift is not None and len(self.space) > 0
+
+    def find_rooms(self) -> None:
+        """Find the rooms of the space that was seen so far; takes a second or two."""
+        if self.has_rooms:
+            rooms = self.rooms.found_in(self.space, self.up.up_world().tolist())
+            self.set_rooms(rooms, rooms.states(self._publication.full().nodes))
+
+    def set_rooms(self, rooms: RoomMap, states: list[wire.RoomState]) -> None:
+        """Set the rooms, and their messages; the next `update` has them if they are others."""
+        self.rooms = rooms
+        self._publication.set_rooms(states, rooms.floors_m)
 
     def add_evidence(self, evidence: RelationEvidence) -> None:
         """Take in neighbour pairs and predictions; see `EdgeBeliefs.add`."""

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from rich.console import Console
 from support.view import make_edge, make_graph, make_node, make_room
 
+from deworldsg_ros.cli import outputs
 from deworldsg_ros.scene.arrays import shared_areas
 from deworldsg_ros.scene.camera import pose_from_quaternion
-from deworldsg_ros.view import page, picture, table
+from deworldsg_ros.view import page, picture
 from deworldsg_ros.view.colours import (
     PALETTE,
     class_colours,
@@ -126,7 +127,7 @@ def test_marker_ids_are_unique_stable_and_fit_their_message():
 def printed(graph, **options):
     console = Console(width=120, record=True, force_terminal=False)
     with console.capture() as capture:
-        table.print_graph(console, graph, **options)
+        outputs.print_graph(console, graph, **options)
     return capture.get()
 
 
