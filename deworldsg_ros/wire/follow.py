@@ -117,6 +117,11 @@ class GraphReplica:
         """Unit vector (3,) against gravity; None = the messages do not tell it."""
         return self._up if isinstance(self._up, list) else None
 
+    @property
+    def rooms(self) -> list[wire.RoomState]:
+        """The rooms; empty if the messages tell none."""
+        return self._rooms[0] if isinstance(self._rooms[0], list) else []
+
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
         """Replace the copy by a snapshot."""
         self._stamp = snapshot.stamp
