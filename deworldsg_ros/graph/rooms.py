@@ -28,9 +28,9 @@ from deworldsg_ros.graph.extent import horizontal_axes, rounded
 from deworldsg_ros.graph.floor_plan import LOWEST_M, fans, rays_of
 from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
-from deworldsg_ros.scene.checks import checked, holds
+from deworldsg_ros.scene.checks import checked, holds, within
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.limits import MAX_INT, MAX_ROOMS, check_labels
+from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M, MAX_INT, MAX_ROOMS, check_labels
 from deworldsg_ros.scene.vocabulary import ROOM_KINDS, ROOM_PRIOR, THINGS_OF_ROOMS, plain
 from deworldsg_ros.wire import messages as wire
 
@@ -40,8 +40,11 @@ CELL_M = 0.05
 TALL_M, TOP_M = 1.2, 1.9
 # A cell has a wall from so many points on; fewer may be errors at the edges of things.
 LEAST_POINTS = 3
+# Of the rows of an image, one of so many is looked at for air.
+ROWS = 3
 # Floors are so far apart at least, and a camera is so high above its own.
 STOREY_M, LOWEST_CAMERA_M, HIGHEST_CAMERA_M = 2.0, 0.3, 2.3
+MOST_STOREYS = 100
 # A floor is a layer of this height with this part of the points of the largest one. Levels of one
 # storey differ by less than `STEP_M`.
 LAYER_M, FLOOR_PART, STEP_M = 0.05, 0.25, 0.4
@@ -169,9 +172,9 @@ def _cells(views: Sequence[_View], floor: float) -> Storey:
     free, tall_free = np.zeros((2, rows, columns), np.uint8)
     origin = corner * CELL_M
     for camera, rays, depth in views:
+        some, closed = rays[::ROWS], _without_gaps(depth[::ROWS])
         for image, low in ((free, LOWEST_M), (tall_free, TALL_M)):
-            # Every other row of an image is enough.
-            for fan in fans(camera, rays[::2], depth[::2], (floor + low, floor + TOP_M)):
+            for fan in fans(camera, some, closed, (floor + low, floor + TOP_M)):
                 cv2.fillPoly(image, [np.floor((fan - origin) / CELL_M).astype(np.int32)], 1)
     levels = points[:, 2] - floor
     at = np.floor(points[:, :2] / CELL_M).astype(np.int64) - corner
@@ -190,6 +193,12 @@ def _cells(views: Sequence[_View], floor: float) -> Storey:
     no_rooms = np.zeros((rows, columns), np.int64)
     seen_free = (free > 0) & ~wall
     return Storey(floor, corner, seen_free, wall, on_floor > 0, visited > 0, no_rooms)
+
+
+def _without_gaps(depth: Float64) -> Float64:
+    """Depth with single lost pixels as near as the nearer neighbour: a gap divides a fan."""
+    sides = np.pad(depth, ((0, 0), (1, 1)))
+    return np.where(depth > 0, depth, np.minimum(sides[:, :-2], sides[:, 2:]))
 
 
 def _points(camera: Float64, rays: Float64, depth: Float64) -> Float64:
@@ -392,7 +401,7 @@ class RoomMap:
                 storey = _continued(one, storey)
             known.append(storey)
         storeys, next_id = [], self.next_id
-        for storey in sorted(known, key=lambda one: one.floor_m):
+        for storey in sorted(known, key=lambda one: one.floor_m)[:MOST_STOREYS]:
             ids, next_id = _identified(storey, next_id)
             storeys.append(replace(storey, ids=ids))
         return replace(self, storeys=tuple(storeys), axes=axes, next_id=next_id)
@@ -505,6 +514,12 @@ class RoomMap:
         axes = np.array(saved.axes).reshape(3, 3)
         holds("rooms (axes)", bool(np.allclose(axes @ axes.T, np.eye(3), atol=1e-6)), "unit axes")
         holds("rooms (storeys)", len(saved.corners) == len(saved.floors_m), "a corner a storey")
+        within(
+            "rooms (floors)",
+            np.array(saved.floors_m),
+            -MAX_GRAPH_COORDINATE_M,
+            MAX_GRAPH_COORDINATE_M,
+        )
         check_labels(list(saved.names.values()))
         storeys = []
         for number, (floor, corner) in enumerate(zip(saved.floors_m, saved.corners)):
