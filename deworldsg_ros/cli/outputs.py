@@ -20,7 +20,7 @@ from deworldsg_ros.base.files import check_writable, together, write_atomically
 from deworldsg_ros.base.words import visible
 from deworldsg_ros.checkpoints.catalogue import unused_detector
 from deworldsg_ros.client.graph import SceneGraph
-from deworldsg_ros.client.objects import scene_object
+from deworldsg_ros.client.objects import SURE, Rooms, scene_object
 from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.doctor import Finding, FrameSampler, Observations, find
 from deworldsg_ros.graph.embeddings import embeddings_path
@@ -208,6 +208,12 @@ def print_graph(console: Console, graph: wire.SceneGraphMessage, most: int = MOS
     """Print the most observed objects and the most probable relations, at most `most` of each."""
     console.print(object_table(graph, most))
     console.print(relation_table(graph, most))
+    if isinstance(graph.rooms, list) and graph.rooms:
+        rooms = ", ".join(
+            f"{room.name} of {room.area_m2:.0f} m²" + ("" if room.probability >= SURE else " (?)")
+            for room in Rooms.of_message(graph.rooms)
+        )
+        console.print(Text(f"rooms: {visible(rooms)}"), highlight=False)
 
 
 def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
