@@ -416,7 +416,7 @@ def crate_view(stamp: int, ground_m: float | None, mask_above_m: float = 0.02) -
     ("ground_m", "bottom_m"),
     [
         (0.0, 0.0),
-        # The ground is not known, or far below: a crate on a wall. What is seen is the crate itself.
+        # No ground near below, as of a crate on a wall: what is seen there is the crate itself.
         (None, 0.015),
         (-0.5, 0.015),
     ],
