@@ -213,6 +213,6 @@ def test_rooms_have_outlines_names_and_their_objects(chromium, tmp_path):
         until(shown, "document.querySelector('#card dl') !== null", "the card")
         assert "kitchen (room 7)?, 90 %" in shown.locator("#card").inner_text().replace("\xa0", " ")
         with_rooms = drawn(pixels(shown))
-        shown.locator("#switches label", has_text="rooms").click()
+        shown.locator("#switches label", has_text="outlines").click()
         until(shown, "document.querySelectorAll('#labels .place').length === 0", "no names")
         assert drawn(pixels(shown)) < with_rooms
