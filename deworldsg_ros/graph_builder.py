@@ -140,11 +140,10 @@ class GraphBuilder:
         local = candidates(self.graph.admit(local), self._relations)
         if self._due or self.trail.is_changing:
             local = self._catch_up(local)
-        T_given, T_graph_poses = local.T_world_camera, np.eye(4)
+        T_given = local.T_world_camera
         if self._drift is not None:
             local = self._drift.align(local)
-            T_graph_poses = self._drift.T_graph_poses
-        if self.trail.note(local.stamp_ns, T_given, T_graph_poses):
+        if self.trail.note(local.stamp_ns, T_given, local.T_world_camera):
             self.graph.nodes.halve_keyframes()
         self.graph.nodes.keyframe = self.trail.keyframe
         logits = local.relations.logits

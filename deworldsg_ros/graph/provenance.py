@@ -255,15 +255,15 @@ class Trail:
     """
 
     def __init__(self) -> None:
-        # Of the frames: stamps and poses as they came. Of the keyframes: the row of the first
-        # frame, and what the correction of drift had done to its pose.
+        # Of the frames: stamps and poses as they came. Of the keyframes: the stamp of the first
+        # frame, and what the correction of drift has done to the poses, a mean.
         self._stamps_ns: Int64 = np.zeros(0, np.int64)
         self._poses: Float64 = np.zeros((0, 4, 4))
         self._count = 0
         self.keyframe, self.is_changing = 0, False
         self._starts_ns: list[int] = []
         self._T_graph_poses: list[Float64] = []
-        self._starts_anew = True
+        self._starts_anew, self._start, self._frames = True, np.eye(4), 0
         self._T_body_camera: Float64 | None = None
         # Of poses on their way: the change, until when they come, and the last pose before.
         self._coming = np.eye(4), 0, np.eye(4)
@@ -284,7 +284,7 @@ class Trail:
         self._coming = T_new_old, until_ns, T_world_camera
         return T_new_old
 
-    def note(self, stamp_ns: int, T_world_camera: Float64, T_graph_poses: Float64) -> bool:
+    def note(self, stamp_ns: int, T_world_camera: Float64, T_graph_camera: Float64) -> bool:
         """Add a frame; returns whether only half of the keyframes stayed.
 
         Then what had number n has (n + 1) // 2.
@@ -292,7 +292,8 @@ class Trail:
         Args:
             stamp_ns: of the frame.
             T_world_camera: (4, 4) pose as it came.
-            T_graph_poses: (4, 4) what the correction of drift does to it, without the trembling.
+            T_graph_camera: (4, 4) pose under which the graph takes it in: the correction of drift
+                changes it. For a keyframe, the mean change of its frames counts.
         """
         last = self._count - 1
         if last >= 0 and stamp_ns <= self._stamps_ns[last]:  # the clock was set back
@@ -315,9 +316,16 @@ class Trail:
                 self._starts_ns = self._starts_ns[::2]
                 self._T_graph_poses = self._T_graph_poses[::2]
             self._starts_ns.append(stamp_ns)
-            self._T_graph_poses.append(T_graph_poses)
+            self._T_graph_poses.append(np.eye(4))
+            self._frames = 0
             self._starts_anew, self._start = False, T_world_camera
             self.keyframe = len(self._starts_ns)
+        self._frames += 1
+        change = np.eye(4)
+        change[:3, :3] = T_graph_camera[:3, :3] @ T_world_camera[:3, :3].T
+        change[:3, 3] = T_graph_camera[:3, 3] - change[:3, :3] @ T_world_camera[:3, 3]
+        mean = self._T_graph_poses[-1]
+        self._T_graph_poses[-1] = mean + (change - mean) / self._frames
         return halved
 
     def _is_new(self, stamp_ns: int, pose: Float64) -> bool:
@@ -451,6 +459,7 @@ class Trail:
         if len(own):
             # The part that the correction of drift has moved it by already is taken back.
             drifts = np.array([self._T_graph_poses[number] for number in own.tolist()])
+            drifts[:, :3, :3] = nearest_rotations(drifts[:, :3, :3])
             by_number[own + 1] = T_new_old[of[own]] @ invert_poses(drifts)
         for number in own.tolist():
             self._T_graph_poses[number] = np.eye(4)
@@ -472,7 +481,7 @@ class Trail:
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Continue with the `arrays` of an earlier run; ValueError if they are none."""
-        if _TRAIL + "starts_ns" not in arrays:  # older releases have none
+        if not len(arrays.get(_TRAIL + "starts_ns", ())):  # older releases have none
             return
         starts = checked(arrays, _TRAIL + "starts_ns", np.int64, None)
         count = len(starts)
@@ -486,7 +495,8 @@ class Trail:
             within(_TRAIL + name, values, -1e8, 1e8)
         self._starts_ns, self._T_graph_poses = starts.tolist(), list(drifts)
         self._stamps_ns, self._poses, self._count = starts.copy(), poses.copy(), count
-        self.keyframe = count
+        self.keyframe, self._starts_anew = count, False
+        self._start = poses[-1]
 
 
 def _marks(poses: Float64) -> Float64:

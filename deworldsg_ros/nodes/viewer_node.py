@@ -9,7 +9,6 @@ from functools import partial
 from typing import Any
 
 import msgspec
-import numpy as np
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
@@ -131,7 +130,7 @@ class ViewerNode(StageNode):
     def _add(self, part: str, stamp_ns: int, decode: Callable[[], Any]) -> None:
         view = self._frames.add(part, stamp_ns, decode, time.monotonic())
         if view is not None:
-            self._trail.note(view.stamp_ns, view.T_world_camera, np.eye(4))
+            self._trail.note(view.stamp_ns, view.T_world_camera, view.T_world_camera)
             if view.local is not None:
                 self._world_frame = view.local.frame_id
             self._viewer.look(view)

@@ -91,7 +91,7 @@ def drifted(poses: np.ndarray, metres: float = 1.0, degrees: float = 5.0) -> np.
 def trail_of(stamps_ns: np.ndarray, poses: np.ndarray, drift: np.ndarray | None = None) -> Trail:
     trail = Trail()
     for stamp_ns, T in zip(stamps_ns.tolist(), poses):
-        trail.note(stamp_ns, T, np.eye(4) if drift is None else drift)
+        trail.note(stamp_ns, T, T if drift is None else drift @ T)
     return trail
 
 
@@ -213,12 +213,12 @@ def test_a_trail_is_bounded_and_a_clock_that_is_set_back_begins_another(monkeypa
     stamps, true = loop(400, radius_m=10.0)
     trail, halved = Trail(), 0
     for stamp_ns, T in zip(stamps.tolist(), true):
-        halved += trail.note(stamp_ns, T, np.eye(4))
+        halved += trail.note(stamp_ns, T, T)
     assert halved >= 2 and trail.keyframe <= 16 and len(trail._stamps_ns) <= 64
     change = trail.since(shift(1.0), int(stamps[200]))
     assert 0 < change.moved.sum() < len(change.moved)
     assert not change.moved[0] and not change.moved[1] and change.moved[-1]
-    trail.note(S // 2, true[0], np.eye(4))
+    trail.note(S // 2, true[0], true[0])
     change = trail.since(shift(1.0), 0)
     np.testing.assert_array_equal(np.flatnonzero(change.moved), [trail.keyframe])
     assert np.iinfo(np.uint16).max == MAX_KEYFRAMES
