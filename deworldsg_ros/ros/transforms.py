@@ -9,7 +9,6 @@ from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Path
 
 from deworldsg_ros.graph.provenance import Trail, TrailChange
-from deworldsg_ros.ros.inputs import POSE_DEPTH, TFMessage
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable, source
 from deworldsg_ros.scene.arrays import Float64
@@ -28,10 +27,17 @@ from deworldsg_ros.streams.poses import (
 )
 from deworldsg_ros.wire import messages as wire
 
+try:  # Part of ROS 2, but not of its wheels.
+    from tf2_msgs.msg import TFMessage as TFMessage
+except ImportError:
+    TFMessage = None
 try:  # Part of RTAB-Map.
     from rtabmap_msgs.msg import MapGraph as MapGraph
 except ImportError:
     MapGraph = None
+
+# Messages that DDS keeps: half a second of poses at 200 Hz, and as much camera_info.
+POSE_DEPTH = 100
 
 
 def camera_transform(
