@@ -144,6 +144,7 @@ class GraphBuilder:
         if self._drift is not None:
             local = self._drift.align(local)
         if self.trail.note(local.stamp_ns, T_given, local.T_world_camera):
+            self.settle()  # by the old numbers
             self.graph.nodes.halve_keyframes()
         self.graph.nodes.keyframe = self.trail.keyframe
         logits = local.relations.logits
@@ -258,8 +259,9 @@ class GraphBuilder:
         node_ids = [node_id for node_id in part if node_id in self.graph]
         if node_ids:
             # Points of frames since then stay.
-            T = np.broadcast_to(np.eye(4), (self.trail.keyframe + 1, 4, 4)).copy()
-            T[: len(self._T_new_old)] = self._T_new_old
+            known = len(self._T_new_old)
+            T = np.broadcast_to(np.eye(4), (max(known, self.trail.keyframe + 1), 4, 4)).copy()
+            T[:known] = self._T_new_old
             slots = self.graph.nodes.slots_of(node_ids)
             self._boxes.move(node_ids, self.merging.move(self.graph, slots, T, self._due))
 

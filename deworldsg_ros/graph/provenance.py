@@ -366,7 +366,8 @@ class Trail:
             return None
         new = bodies @ self._T_body_camera
         if np.linalg.norm(_marks(new) - _marks(given), axis=-1).max() < CHANGED_M:
-            self._T_body_camera = _mounting(bodies, given)  # more poses tell more exactly
+            known = _mounting(bodies, given)  # more poses tell more exactly
+            self._T_body_camera = self._T_body_camera if known is None else known
             return None
         knots = self._knots(stamps_ns, new @ invert_poses(given))
         T = interpolate_poses(*knots, frames)
