@@ -37,7 +37,7 @@ from bench.steps import Marker, mark_node, read_marks, step_lines, write_marks
 from deworldsg_ros.cli.demo import LoggedProcess, end_all
 from deworldsg_ros.cli.terminal import dds_environment
 from deworldsg_ros.config import Config
-from deworldsg_ros.nodes.start import keep_freed_memory
+from deworldsg_ros.nodes import keep_freed_memory
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.recordings.recording import open_recording

@@ -23,7 +23,7 @@ from support.reference_lifting import reference_lift  # noqa: E402
 from bench.figures import Figure, Paired, Setup, in_turn  # noqa: E402
 from deworldsg_ros.config import LiftingConfig  # noqa: E402
 from deworldsg_ros.lifting import Lifting  # noqa: E402
-from deworldsg_ros.nodes.start import keep_freed_memory  # noqa: E402
+from deworldsg_ros.nodes import keep_freed_memory  # noqa: E402
 from deworldsg_ros.scene.camera import Intrinsics  # noqa: E402
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary  # noqa: E402
 

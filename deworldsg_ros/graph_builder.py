@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from deworldsg_ros.config import Config, MergingConfig
-from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.edits import GraphEdit, NameRoom
 from deworldsg_ros.graph.extent import NodeBoxes
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import hidden_node
 from deworldsg_ros.graph.pairs import frame_votes
 from deworldsg_ros.graph.provenance import FrameMemory, SeenSpace, Trail, TrailChange
 from deworldsg_ros.graph.publication import Publication
+from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.poses.drift import Drift, moved
@@ -52,6 +53,7 @@ class GraphBuilder:
         frames: from which frames the nodes and edges come.
         space: the space that the camera has seen as free.
         trail: the poses of the frames.
+        rooms: the rooms of that space, as of the last `find_rooms` or `set_rooms`.
         prior: of class pairs.
         refused: what was left out of the newest frame, in words, by reason.
     """
@@ -86,6 +88,7 @@ class GraphBuilder:
             include_surface_points=output.include_surface_points,
         )
         self.frames, self.space, self.trail = FrameMemory(), SeenSpace(), Trail()
+        self.rooms = RoomMap()
         # How keyframes have moved, and the nodes that have still to follow.
         self._T_new_old, self._due = np.eye(4)[None], list[int]()
         self._newest_ns: int | None = None
@@ -177,7 +180,7 @@ class GraphBuilder:
         except RefusedInput as refusal:
             self.refused[refusal.reason] = str(refusal)
 
-    def edit(self, request: EditRequest) -> EditReply:
+    def edit(self, request: GraphEdit) -> EditReply:
         """Make an operator's edit, or undo the newest one.
 
         The next `update` contains what it changes.
@@ -186,11 +189,32 @@ class GraphBuilder:
             RefusedInput: ``invalid_request``, with the reason; nothing is changed then.
         """
         self.settle()
+        if isinstance(request, NameRoom):
+            rooms = self.rooms.named(request.room, request.name)
+            self.set_rooms(rooms, rooms.states(self.snapshot().nodes))
+            said = f"is called {request.name}" if request.name else "is called by what it contains"
+            return EditReply("name_room", [], f"room {request.room} {said}")
         reply = self.merging.edit(self.graph, request, self.newest_ns)
         for node_id in reply.nodes:
             for old_id in self.graph.edits.origins(node_id):
                 self.frames.copy(old_id, node_id)
         return reply
+
+    @property
+    def has_rooms(self) -> bool:
+        """Whether rooms are looked for: the paper has none."""
+        return self._drift is not None and len(self.space) > 0
+
+    def find_rooms(self) -> None:
+        """Find the rooms of the space that was seen so far; takes a second or two."""
+        if self.has_rooms:
+            rooms = self.rooms.found_in(self.space, self.up.up_world().tolist())
+            self.set_rooms(rooms, rooms.states(self._publication.full().nodes))
+
+    def set_rooms(self, rooms: RoomMap, states: list[wire.RoomState]) -> None:
+        """Set the rooms, and their messages; the next `update` has them if they are others."""
+        self.rooms = rooms
+        self._publication.set_rooms(states, rooms.floors_m)
 
     def add_evidence(self, evidence: RelationEvidence) -> None:
         """Take in neighbour pairs and predictions; see `EdgeBeliefs.add`."""

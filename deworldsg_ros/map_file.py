@@ -1,7 +1,7 @@
 """A graph as a map: a file from which a later run continues.
 
 It contains the graph, the state of merging, the priors of class pairs, the up direction, from which
-frames everything comes, and the space that the camera saw as free.
+frames everything comes, the space that the camera saw as free, and its rooms.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ from deworldsg_ros.base.files import (
 from deworldsg_ros.base.words import counted, whole_number
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph import graph_files
-from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.edits import GraphEdit
 from deworldsg_ros.graph.nodes import MAX_ID
 from deworldsg_ros.graph.provenance import FrameMemory, SeenFrames
+from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.relations.paper import ClassPairPrior, PriorState
@@ -63,6 +64,7 @@ def copy_state(builder: GraphBuilder) -> Arrays:
     up = np.array(builder.up.state())
     more: Arrays = {"prior": prior, "up": up, "seen_frames": seen, **builder.space.arrays()}
     more.update(builder.trail.arrays())
+    more.update(builder.rooms.arrays())
     return {**arrays, **memory, **more}
 
 
@@ -221,12 +223,13 @@ def _read(config: Config, path: Path) -> GraphBuilder:
         builder.up.restore(arrays["up"])
     builder.space.restore(arrays)
     builder.trail.restore(arrays)
+    builder.rooms = RoomMap.restored(arrays)
     if "seen_frames" in arrays:  # nor this
         builder.frames = FrameMemory(_seen_frames(arrays, graph.vocabulary))
     return builder
 
 
-def edit_map(path: Path, request: EditRequest) -> EditReply:
+def edit_map(path: Path, request: GraphEdit) -> EditReply:
     """Make an operator's edit in a map, or undo the newest one; the map before it stays.
 
     Raises:

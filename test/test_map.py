@@ -14,11 +14,12 @@ import pytest
 from msgspec import UNSET
 from support.killing import full_disk, killed, moments_s, names
 from support.merging import VOCABULARY, random_local_graphs
+from support.spaces import seen_room
 from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab
 from typer.testing import CliRunner
 
 from deworldsg_ros.cli.app import app
-from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsConfig
+from deworldsg_ros.config import Config, InputsConfig, MergingConfig, OutputConfig, RelationsConfig
 from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import claim_map, continue_map, previous_of, read_map, write_map
@@ -313,3 +314,35 @@ def test_the_node_continues_its_map_and_writes_it_at_the_end(tmp_path):
         generation.write_text("no map")
     with pytest.raises(ConfigurationError, match=r"room\.map"), graph_node(path):
         pass
+
+
+def test_rooms_are_in_the_graph_the_map_and_edits(tmp_path: Path) -> None:
+    config = msgspec.structs.replace(config_of(), inputs=InputsConfig(world_up="z"))
+    builder = builder_of(*(frame(stamp, (WHOLE, TABLE)) for stamp in range(1, 5)), config=config)
+    assert builder.full().rooms is UNSET
+    builder.space = seen_room()
+    builder.find_rooms()
+    (room,) = builder.full().rooms
+    assert 8.0 < room.area_m2 < 12.5 and room.objects[0].id == 1
+    update = builder.update()
+    assert update.rooms == [room] and update.storeys_m == [pytest.approx(0.0, abs=0.05)]
+    assert builder.snapshot().rooms == [room]
+    builder.find_rooms()
+    assert builder.update() is None  # nothing new
+    path = saved(builder, tmp_path)
+    for words, label in ((["study"], "study"), ([], room.label)):
+        done = CliRunner().invoke(app, ["edit", str(path), "name_room", str(room.id), *words])
+        assert done.exit_code == 0, done.output
+        again = read_map(config, path)
+        again.find_rooms()
+        (kept,) = again.full().rooms
+        assert (kept.id, kept.label) == (room.id, label)
+    refused = CliRunner().invoke(app, ["edit", str(path), "name_room", "9", "study"])
+    assert refused.exit_code != 0 and "room 9 is unknown; rooms: 1" in refused.output
+
+
+def test_the_paper_has_no_rooms() -> None:
+    builder = seen(4, association="paper")
+    builder.space = seen_room()
+    builder.find_rooms()
+    assert builder.full().rooms is UNSET and not builder.rooms.arrays()

@@ -143,6 +143,8 @@ def _graph_examples() -> dict[str, wire.Message]:
             edges=[_cup_on_table()],
             up=[0.0, 0.0, 1.0],
             hidden=[wire.HiddenNode("vase", [1.0, 0.2, 0.9], 0.31, 2, "seen too little")],
+            rooms=[_kitchen(), _hallway()],
+            storeys_m=[0.0],
         ),
         "scene_graph_updates": wire.SceneGraphUpdateMessage(
             **_head("scene_graph_updates"),
@@ -212,6 +214,33 @@ def _node(
         box=wire.GravityBox(mean, [0.12, 0.1, 0.1], [0.0, 0.0, 0.0, 1.0]),
         surface_mm=b"\n\x00\x00\x00\xec\xff",
         colour_lab=[41.5, 52.0, 30.5],
+    )
+
+
+def _kitchen() -> wire.RoomState:
+    return wire.RoomState(
+        id=1,
+        label="kitchen",
+        kinds=[wire.Belief("kitchen", 0.93), wire.Belief("dining room", 0.04)],
+        storey=0,
+        outline_m=[[0.0, 0.0, 0.0], [3.2, 0.0, 0.0], [3.2, 2.9, 0.0], [0.0, 2.9, 0.0]],
+        area_m2=9.28,
+        doorways=[wire.Doorway(to=2, position_m=[3.26, 1.4, 0.0], width_m=0.85)],
+        objects=[wire.RoomObject(id=1, probability=1.0), wire.RoomObject(id=2, probability=0.97)],
+    )
+
+
+def _hallway() -> wire.RoomState:
+    return wire.RoomState(
+        id=2,
+        label="Anna's hall",
+        kinds=[wire.Belief("hallway", 0.61), wire.Belief("bedroom", 0.14)],
+        storey=0,
+        outline_m=[[3.32, 0.0, 0.0], [4.6, 0.0, 0.0], [4.6, 6.0, 0.0], [3.32, 6.0, 0.0]],
+        area_m2=7.68,
+        doorways=[wire.Doorway(to=1, position_m=[3.26, 1.4, 0.0], width_m=0.85)],
+        objects=[],
+        label_provenance="operator",
     )
 
 

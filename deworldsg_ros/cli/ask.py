@@ -30,7 +30,15 @@ from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.mcp_server import WatchedFile, make_server
 from deworldsg_ros.client.objects import SURE, odds_of
 from deworldsg_ros.client.questions import Answers, ask
-from deworldsg_ros.graph.edits import DeleteNode, EditRequest, MergeNodes, SetLabel, SplitNode, Undo
+from deworldsg_ros.graph.edits import (
+    DeleteNode,
+    GraphEdit,
+    MergeNodes,
+    NameRoom,
+    SetLabel,
+    SplitNode,
+    Undo,
+)
 from deworldsg_ros.graph.extent import DEFAULT_UP
 from deworldsg_ros.graph.graph_files import graph_path
 from deworldsg_ros.scene.arrays import Float64
@@ -255,6 +263,20 @@ def _print_answers(answers: Answers, frame_id: str, console: Console) -> None:
         )
     if answers.said is not None:
         console.print(answers.said, highlight=False)
+    if answers.rooms:
+        rooms = Table(box=box.SIMPLE)
+        for heading in ("room", "x, y, z (m)", "area (m²)", "p", "odds", "evidence"):
+            rooms.add_column(heading)
+        for one in answers.rooms:
+            rooms.add_row(
+                plain(one.room.name),
+                " ".join(f"{value:.2f}" for value in one.room.center_m),
+                f"{one.room.area_m2:.1f}",
+                f"{one.probability:.0%}",
+                odds_of(one.probability),
+                ("" if one.is_sure else "[yellow]not sure:[/] ") + plain(one.evidence),
+            )
+        console.print(rooms)
     if answers.found:
         console.print(table)
     for note in answers.notes:
@@ -270,15 +292,15 @@ EditLive = Annotated[
 ]
 
 USAGE = (
-    "set_label ID LABEL, merge ID ID, split ID [X,Y,Z X,Y,Z], delete ID, or undo, after the map "
-    "file or --live"
+    "set_label ID LABEL, merge ID ID, split ID [X,Y,Z X,Y,Z], delete ID, name_room ID [NAME], or "
+    "undo, after the map file or --live"
 )
 
 
 def edit(
     words: Edits, live: EditLive = False, namespace: Namespace = "", as_json: AsJson = False
 ) -> None:
-    """Edit a map: set_label ID LABEL, merge ID ID, split ID, delete ID, undo.
+    """Edit a map: set_label ID LABEL, merge ID ID, split ID, delete ID, name_room ID NAME, undo.
 
     With --live, the graph of the running graph_node. An edit holds for all later frames. `split`
     takes two points, X,Y,Z each: every part of the object belongs to the nearer one.
@@ -297,7 +319,7 @@ def edit(
         print_lines([reply["text"]])
 
 
-def parse_edit(words: list[str]) -> EditRequest:
+def parse_edit(words: list[str]) -> GraphEdit:
     """The request of words such as ``merge 4 7``; ClientError for others."""
     verb, *rest = words or [""]
     try:
@@ -311,6 +333,8 @@ def parse_edit(words: list[str]) -> EditRequest:
             return msgspec.convert(request, SplitNode)
         if verb == "delete" and len(rest) == 1:
             return DeleteNode(_number(rest[0]))
+        if verb == "name_room" and rest:
+            return msgspec.convert({"room": _number(rest[0]), "name": " ".join(rest[1:])}, NameRoom)
         if verb == "undo" and not rest:
             return Undo()
     except ValueError as error:  # msgspec's errors are such
@@ -325,7 +349,7 @@ def _number(word: str) -> int:
     return number
 
 
-def _edit_live(namespace: str, verb: str, request: EditRequest) -> dict[str, Any]:
+def _edit_live(namespace: str, verb: str, request: GraphEdit) -> dict[str, Any]:
     from deworldsg_ros.client import SceneGraphClient
 
     with SceneGraphClient(namespace) as client:

@@ -12,11 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
+from rich.style import Style
+from rich.table import Table
 from rich.text import Text
 
 from deworldsg_ros.base.files import check_writable, together, write_atomically
 from deworldsg_ros.base.words import visible
 from deworldsg_ros.checkpoints.catalogue import unused_detector
+from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.client.objects import SURE, Rooms, scene_object
 from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.doctor import Finding, FrameSampler, Observations, find
 from deworldsg_ros.graph.embeddings import embeddings_path
@@ -29,6 +33,7 @@ from deworldsg_ros.ros.health import REASONS, UNMATCHED_PREFIX
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import RgbdFrame, UpEstimator
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.view.colours import class_colours
 from deworldsg_ros.wire import messages as wire
 
 if TYPE_CHECKING:
@@ -108,13 +113,13 @@ def show_graph(
         space: what the camera saw of the room; None = the page has no surface of it.
     """
     # Imported here because matplotlib takes a second to load.
-    from deworldsg_ros.view import page, photos, picture, table
+    from deworldsg_ros.view import page, photos, picture
 
     up = UpEstimator(world_up)
     for T_world_camera in T_world_cameras:
         up.observe(T_world_camera)
     path_world = np.array([T[:3, 3] for T in T_world_cameras], np.float64).reshape(-1, 3)
-    table.print_graph(console, graph, MOST_ROWS)
+    print_graph(console, graph)
     with console.status("drawing …"):
         picture.draw(
             graph,
@@ -192,6 +197,90 @@ def print_noted(console: Console, note: str, text: str) -> None:
 def print_part(console: Console, frames: int, images: int) -> None:
     """Say that the results are those of a part of a recording."""
     print_noted(console, "stopped:", f"the results are those of {frames} of {images} frames")
+
+
+# --- The graph as two tables on the terminal: objects, and relations.
+
+PROVENANCE_STYLES = {"visual": "", "prior": "yellow", "fused": "cyan"}
+
+
+def print_graph(console: Console, graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> None:
+    """Print the most observed objects and the most probable relations, at most `most` of each."""
+    console.print(object_table(graph, most))
+    console.print(relation_table(graph, most))
+    if isinstance(graph.rooms, list) and graph.rooms:
+        rooms = ", ".join(
+            f"{room.name} of {room.area_m2:.0f} m²" + ("" if room.probability >= SURE else " (?)")
+            for room in Rooms.of_message(graph.rooms)
+        )
+        console.print(Text(f"rooms: {visible(rooms)}"), highlight=False)
+
+
+def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
+    """Objects, most observed first, with the sides of their boxes."""
+    table = Table(
+        title=_title("object", len(graph.nodes), most),
+        caption=Text(
+            "p: it exists and is that; an object without a name: it exists; "
+            f"position in frame {graph.frame_id!r}; "
+            "size: length, width and height; seen: number of frames"
+        ),
+    )
+    table.add_column("object", no_wrap=True)
+    table.add_column("p", justify="right")
+    table.add_column("x, y, z (m)", justify="right", no_wrap=True)
+    table.add_column("size (cm)", justify="right", no_wrap=True)
+    table.add_column("seen", justify="right")
+    colours = class_colours(node.label for node in graph.nodes)
+    up = SceneGraph(graph).up
+    for node in sorted(graph.nodes, key=lambda node: (-node.observations, node.id))[:most]:
+        item = scene_object(node, graph.frame_id, up)
+        table.add_row(
+            _name(node.label, node.id, Style(color=colours[node.label])),
+            _percent(item.probability),
+            " ".join(f"{value:6.2f}" for value in item.position_m),
+            " × ".join(item.size_words),
+            str(node.observations),
+        )
+    return table
+
+
+def relation_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
+    """Relations, most probable first."""
+    table = Table(title=_title("relation", len(graph.edges), most))
+    for name in ("subject", "predicate", "object"):
+        table.add_column(name, no_wrap=True)
+    table.add_column("p", justify="right")
+    table.add_column("provenance", no_wrap=True)
+    table.add_column("seen", justify="right")
+    names = {node.id: _name(node.label, node.id) for node in graph.nodes}
+    edges = sorted(
+        graph.edges,
+        key=lambda edge: (-edge.probability, -edge.observations, edge.subject, edge.object),
+    )
+    for edge in edges[:most]:
+        table.add_row(
+            names.get(edge.subject, _name("?", edge.subject)),
+            Text(visible(edge.predicate), "bold"),
+            names.get(edge.object, _name("?", edge.object)),
+            _percent(edge.probability),
+            Text(edge.provenance, PROVENANCE_STYLES[edge.provenance]),
+            str(edge.observations),
+        )
+    return table
+
+
+def _title(noun: str, number: int, most: int) -> str:
+    plural = noun if number == 1 else f"{noun}s"
+    return f"{number} {plural}" + (f" (the first {most})" if number > most else "")
+
+
+def _name(label: str, node_id: int, style: str | Style = "") -> Text:
+    return Text.assemble((visible(label), style), (f" #{node_id}", "dim"))
+
+
+def _percent(probability: float) -> str:
+    return f"{100 * probability:.0f} %"
 
 
 # --- Observations of a run for the doctor, and the output of its findings.

@@ -324,6 +324,8 @@ def _node_count(pipeline: Pipeline) -> str:
 def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
     """Write the graph, its views, the report, the trajectory and the map; print the tables."""
     pipeline, processed = ran.pipeline, ran.processed
+    if pipeline.builder is not None:
+        pipeline.builder.find_rooms()
     graph = pipeline.graph()
     T_world_cameras = list(processed.poses.values())
     with outputs.writing(options.out, pipeline.config) as staged:

@@ -11,7 +11,7 @@ from deworldsg_ros.client.changes import Changes, Pairing
 from deworldsg_ros.client.explain import Explanation
 from deworldsg_ros.client.goals import Goal, Robot
 from deworldsg_ros.client.graph import SceneGraph
-from deworldsg_ros.client.objects import HiddenObject, Relation, SceneObject
+from deworldsg_ros.client.objects import HiddenObject, Relation, Room, Rooms, SceneObject
 from deworldsg_ros.scene.errors import ClientError
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ __all__ = [
     "Pairing",
     "Relation",
     "Robot",
+    "Room",
+    "Rooms",
     "SceneGraph",
     "SceneGraphClient",
     "SceneObject",

@@ -390,6 +390,9 @@ def combine(
         nodes=[nodes[node_id] for node_id in sorted(nodes)],
         edges=_edges(a.message.edges, b.message.edges, ids),
         up=list(a.up),
+        # Those of one graph say nothing of the other.
+        rooms=msgspec.UNSET,
+        storeys_m=msgspec.UNSET,
     )
     return Combined(message, T_a_b, confidence, tuple(pairs), ids)
 

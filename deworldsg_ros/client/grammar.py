@@ -26,6 +26,9 @@ from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 #     time      = number [ "s" ] [ "ago" ]     a stamp in seconds, or seconds before the graph's
 #     stamp
 #
+# "in the kitchen" is a condition with a room. A thing may be a room: "rooms next to the hall",
+# "bedrooms with a desk". "which room is the cup in" is "room with cup".
+#
 # Articles and words such as "which", "where", "there", "could you tell me" are skipped, and so is a
 # last "in the room" or "here".
 
@@ -188,8 +191,13 @@ def parse(question: str, predicates: Collection[str] = ()) -> Pattern | Since | 
     elif tokens[:1] in (["is"], ["are"]):
         kind = "holds" if tokens[1:2] == ["the"] else "exists"
     tokens = [token for token in tokens if token not in SKIPPED]
-    if len(tokens) > 1 and tokens[-1] in PLACES:
+    if len(tokens) > 1 and tokens[-1] in PLACES and (tokens[-2] == "in" or tokens[-1] != "room"):
         tokens = tokens[: -2 if tokens[-2] == "in" else -1]
+    asked = tokens[1:] if tokens[:1] == ["what"] else tokens
+    if asked[:1] == ["room"] and asked[-1] == "in":
+        tokens = ["room", "with", *asked[1:-1]]
+    elif asked[:2] == ["in", "room"]:
+        tokens = ["room", "with", *asked[2:]]
     if tokens[:2] in (["what", "colour"], ["what", "color"]):
         kind, tokens = "colour", tokens[3:] if tokens[2:3] == ["of"] else tokens[2:]
     return _Reader(question, tokens, _longest_first(predicates)).pattern(kind)

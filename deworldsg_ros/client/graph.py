@@ -39,6 +39,8 @@ from deworldsg_ros.client.objects import (
     HiddenObject,
     Point,
     Relation,
+    Room,
+    Rooms,
     SceneObject,
     hidden_object,
     predicate_names,
@@ -53,6 +55,7 @@ from deworldsg_ros.graph.floor_plan import CELL_M as PLAN_CELL_M
 from deworldsg_ros.graph.floor_plan import FloorPlan, floor_plan
 from deworldsg_ros.graph.graph_files import graph_path, read_graph
 from deworldsg_ros.graph.provenance import SeenFrames, SeenSpace, read_seen, read_space
+from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.scene.vocabulary import SYMMETRIC, plain
@@ -255,6 +258,20 @@ class SceneGraph:
         if embeddings_path(file).is_file():
             graph.looks = read_embeddings(embeddings_path(file), graph.stamp_ns)
         return graph
+
+    @cached_property
+    def rooms(self) -> Rooms:
+        """The rooms; of a graph of an older release, found in its views; else there are none."""
+        states = self.message.rooms
+        if not isinstance(states, list):
+            space = self.space or SeenSpace()
+            states = RoomMap().found_in(space, self.up).states(self.message.nodes)
+        return Rooms.of_message(states)
+
+    def room_of(self, which: Which) -> Room | None:
+        """The room in which an object most probably is; None = in none that is known."""
+        found = self.rooms.of(self.one(which).id)
+        return found[0][0] if found else None
 
     def __len__(self) -> int:
         return len(self._nodes)

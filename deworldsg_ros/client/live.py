@@ -281,6 +281,10 @@ class SceneGraphClient:
         """
         self._replica.listeners.append(callback)
 
+    def name_room(self, room: int, name: str) -> dict[str, Any]:
+        """Say what a room is called; an empty name takes it back."""
+        return self.command("name_room", room=room, name=name)
+
     def set_label(self, node: int, label: str) -> dict[str, Any]:
         """Set the class of an object."""
         return self.command("set_label", node=node, label=label)

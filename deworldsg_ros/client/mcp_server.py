@@ -90,13 +90,26 @@ class GraphTools:
             ],
         }
 
+    def list_rooms(self) -> dict[str, Any]:
+        """List the rooms: kind with its probability, storey, area, which are next to which by a
+        doorway, and the ids of the objects in each with the probability that they are in it.
+        """
+        graph = self._graph()
+        storeys_m = graph.message.storeys_m
+        return {
+            **_about(graph),
+            "storeys_m": storeys_m if isinstance(storeys_m, list) else [],
+            "rooms": [room.to_dict() for room in graph.rooms],
+        }
+
     def find(self, question: str) -> dict[str, Any]:
         """Find objects by a pattern. Every answer has odds, evidence, and whether it is sure.
 
         Args:
             question: e.g. "cup on dining table", "chair within 0.5 m of table and near window",
                 "anything near (1, 2, 0.5) within 1 m", "how many cups", "largest plant",
-                "is the bear on the sofa", "what colour is the cup", "the red cup". `notes` tell how
+                "is the bear on the sofa", "what colour is the cup", "the red cup", "cup in the
+                kitchen", "rooms next to the hall", "which room is the cup in". `notes` tell how
                 the name of a class was taken. "like something to drink from" finds what looks like
                 a text in any words, if the graph has embeddings.
         """
@@ -121,6 +134,10 @@ class GraphTools:
         return {
             **_about(graph),
             "object": item.to_dict(),
+            "rooms": [
+                {"id": room.id, "label": room.label, "probability": share}
+                for room, share in graph.rooms.of(item.id)
+            ],
             "relations": [relation.to_dict() for relation in graph.relations_of(item)],
             "neighbours": [
                 {"id": other.id, "label": other.label, "gap_m": round(gap, 3)}
@@ -334,6 +351,7 @@ def make_server(newest: Callable[[], SceneGraph], client: Any = None, edits: boo
     functions: list[Callable[..., dict[str, Any]]] = [
         tools.list_objects,
         tools.list_relations,
+        tools.list_rooms,
         tools.find,
         tools.get_object_context,
         tools.what_changed,

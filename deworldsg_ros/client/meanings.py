@@ -15,6 +15,7 @@ from collections.abc import Collection, Sequence
 
 from deworldsg_ros.scene.vocabulary import (
     COCO_CLASSES,
+    ROOM_KINDS,
     SCANNET_CLASSES,
     VISUAL_GENOME_CLASSES,
     plain,
@@ -216,6 +217,28 @@ KNOWN: frozenset[str] = frozenset(
     )
     for name in names
 )
+
+
+# --- Names of rooms.
+
+# What people call a kind of room.
+ROOM_NAMES: dict[str, str] = {
+    **{kind: kind for kind in ROOM_KINDS},
+    **dict.fromkeys(("kitchenette",), "kitchen"),
+    **dict.fromkeys(("bath room", "restroom", "washroom", "wc", "shower room"), "bathroom"),
+    **dict.fromkeys(("bed room", "sleeping room"), "bedroom"),
+    **dict.fromkeys(("lounge", "sitting room", "livingroom", "family room"), "living room"),
+    **dict.fromkeys(("dining area",), "dining room"),
+    **dict.fromkeys(("study", "workroom", "home office"), "office"),
+    **dict.fromkeys(("hall", "corridor", "entrance hall", "landing", "passage"), "hallway"),
+    **dict.fromkeys(("laundry", "utility room"), "laundry room"),
+}
+
+
+def room_kind(name: str) -> str | None:
+    """The kind of room that a name means, also in the plural: "hall" is hallway; None = none."""
+    forms = [" ".join(form) for form in singular_forms(words_of(name) or [""])]
+    return next((ROOM_NAMES[form] for form in forms if form in ROOM_NAMES), None)
 
 
 # --- Names of colours: the eleven basic ones of English (Berlin and Kay, 1969).

@@ -11,7 +11,13 @@ import numpy as np
 
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.boxes import Footprint, footprint
-from deworldsg_ros.client.meanings import colour_shares, is_class, words_of
+from deworldsg_ros.client.meanings import (
+    colour_shares,
+    is_class,
+    room_kind,
+    singular_forms,
+    words_of,
+)
 from deworldsg_ros.graph.extent import box_of, surface_points
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import ClientError
@@ -32,6 +38,12 @@ def predicate_names(asked: str) -> frozenset[str]:
 
 Point = tuple[float, float, float]
 
+# What a room without a name is called, and why there may be none.
+UNNAMED_ROOM = "room"
+NO_ROOMS = (
+    "none: rooms are found in the views of the camera, with the default association, some seconds "
+    "after they were seen"
+)
 # An answer is sure from odds of two to one. Chosen, not measured.
 SURE = 2 / 3
 
@@ -302,6 +314,144 @@ class HiddenObject:
             "observations": self.observations,
             "reason": self.reason,
         }
+
+
+@dataclass(frozen=True)
+class Room:
+    """A room: a part of the free space that walls and doorways bound.
+
+    Attributes:
+        id: stable; rooms and objects are numbered apart.
+        label: the most probable kind, e.g. "kitchen", or the name that the operator gave; "room" if
+            no kind is probable enough (`is_named`).
+        kinds: probabilities of the kinds, by what is in the room, the best first.
+        storey: 0 = the lowest.
+        outline_m: corners on its floor, in order, world frame, metres.
+        area_m2: of the floor, without what stands at its walls as high as these.
+        doorways: the ids of the rooms that it opens to, with the place and the width of each.
+        objects: ids of the objects in it, with the probability that each is.
+        is_named: false if no kind is probable enough.
+        is_named_by_hand: whether the operator gave the name.
+    """
+
+    id: int
+    label: str
+    kinds: tuple[wire.Belief, ...]
+    storey: int
+    outline_m: tuple[Point, ...]
+    area_m2: float
+    doorways: tuple[wire.Doorway, ...]
+    objects: dict[int, float]
+    is_named: bool
+    is_named_by_hand: bool
+
+    @property
+    def name(self) -> str:
+        """For people: ``kitchen (room 2)``, or ``room 2``."""
+        return f"{self.label} (room {self.id})" if self.is_named else f"room {self.id}"
+
+    @property
+    def probability(self) -> float:
+        """Probability that it is what its label says; 1 for a name by hand, and without one."""
+        is_said = self.is_named_by_hand or not self.is_named
+        return 1.0 if is_said else self.probability_of(self.label)
+
+    def probability_of(self, name: str) -> float:
+        """Probability that the room is called so: a kind, "room", "room 2", or the name by hand."""
+        words = room_words(name)
+        if self.is_named_by_hand and words == room_words(self.label):
+            return 1.0
+        own = [[UNNAMED_ROOM], [UNNAMED_ROOM, str(self.id)]]
+        if any(form in own for form in singular_forms(words or [""])):
+            return 1.0
+        kind = room_kind(name)
+        by_hand = room_kind(self.label) if self.is_named_by_hand else None
+        if kind is None or by_hand is not None:
+            return float(kind is not None and kind == by_hand)
+        return sum(belief.probability for belief in self.kinds if belief.label == kind)
+
+    @property
+    def center_m(self) -> Point:
+        """Mean of the corners of its outline, world frame, metres."""
+        return _point(np.mean(self.outline_m, axis=0)) if self.outline_m else (0.0, 0.0, 0.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "id": self.id,
+            "label": self.label,
+            "probability": round(self.probability, 3),
+            "named": self.is_named,
+            "named_by_hand": self.is_named_by_hand,
+            "kinds": {belief.label: round(belief.probability, 3) for belief in self.kinds},
+            "storey": self.storey,
+            "area_m2": self.area_m2,
+            "center_m": _rounded(self.center_m),
+            "next_to": sorted({door.to for door in self.doorways}),
+            "objects": {str(node_id): share for node_id, share in self.objects.items()},
+        }
+
+
+def room_words(name: str) -> list[str]:
+    """The words of a room's name, without articles: questions have none, either."""
+    return [word for word in words_of(name) if word not in ("the", "a", "an", "my", "our")]
+
+
+class Rooms(tuple[Room, ...]):
+    """The rooms of a graph, by id."""
+
+    @classmethod
+    def of_message(cls, states: Iterable[wire.RoomState]) -> Rooms:
+        """The rooms of a message."""
+        return cls(
+            Room(
+                id=room.id,
+                label=room.label,
+                kinds=tuple(room.kinds),
+                storey=room.storey,
+                outline_m=tuple(_point(corner) for corner in room.outline_m),
+                area_m2=room.area_m2,
+                doorways=tuple(room.doorways),
+                objects={item.id: item.probability for item in room.objects},
+                is_named=room.named,
+                is_named_by_hand=room.label_provenance == "operator",
+            )
+            for room in states
+        )
+
+    def called(self, name: str) -> list[tuple[Room, float]]:
+        """The rooms that may be called so, with the probability that they are, the best first."""
+        found = [(room, room.probability_of(name)) for room in self]
+        known = [pair for pair in found if pair[1] > 0.0]
+        return sorted(known, key=lambda pair: (-pair[1], pair[0].id))
+
+    def one(self, which: Room | int | str) -> Room:
+        """The room with an id, or the one that is most probably called so.
+
+        Raises:
+            ClientError: if there is none.
+        """
+        if isinstance(which, Room):
+            which = which.id
+        found = (
+            [room for room in self if room.id == which]
+            if isinstance(which, int)
+            else [room for room, _ in self.called(which)]
+        )
+        if not found:
+            known = ", ".join(room.name for room in self) or NO_ROOMS
+            raise ClientError(f"there is no room '{which}'; rooms: {known}")
+        return found[0]
+
+    def of(self, node_id: int) -> list[tuple[Room, float]]:
+        """The rooms in which an object may be, with probabilities, the best first."""
+        found = [(room, room.objects[node_id]) for room in self if node_id in room.objects]
+        return sorted(found, key=lambda pair: (-pair[1], pair[0].id))
+
+    def next_to(self, which: Room | int | str) -> list[Room]:
+        """The rooms to which a doorway leads."""
+        near = {door.to for door in self.one(which).doorways}
+        return [room for room in self if room.id in near]
 
 
 def scene_object(node: wire.NodeState, frame_id: str, up: Point) -> SceneObject:

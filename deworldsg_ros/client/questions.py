@@ -11,14 +11,18 @@ from typing import Any
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.grammar import RANKS, Condition, Like, Pattern, Rank, Since, parse
 from deworldsg_ros.client.graph import SceneGraph, distance_m
-from deworldsg_ros.client.meanings import colour_shares, is_class
+from deworldsg_ros.client.meanings import colour_shares, is_class, room_kind
 from deworldsg_ros.client.objects import (
+    NO_ROOMS,
     SURE,
+    UNNAMED_ROOM,
     HiddenObject,
     Point,
     Relation,
+    Room,
     SceneObject,
     odds_of,
+    room_words,
 )
 from deworldsg_ros.scene.errors import ClientError
 
@@ -85,12 +89,43 @@ class Answer:
 
 
 @dataclass(frozen=True)
+class RoomAnswer:
+    """A room that fulfils a pattern.
+
+    Attributes:
+        room: the room.
+        probability: that it is of the kind, and fulfils all conditions.
+        evidence: in words.
+    """
+
+    room: Room
+    probability: float
+    evidence: str
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether `probability` is at least `SURE`."""
+        return self.probability >= SURE
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "room": self.room.to_dict(),
+            "probability": round(self.probability, 3),
+            "odds": odds_of(self.probability),
+            "sure": self.is_sure,
+            "evidence": self.evidence,
+        }
+
+
+@dataclass(frozen=True)
 class Answers:
     """The answers to a pattern.
 
     Attributes:
         question: as asked.
         found: the most probable first, or by the rank that was asked for.
+        rooms: of a question for rooms, in place of `found`.
         notes: what else is worth knowing: how a word was understood, why there is no answer.
         count: of "how many": how many of them are more probable than not; else None.
         probability: of "is there": that at least one object fulfils the question; of "is the": that
@@ -101,6 +136,7 @@ class Answers:
     question: str
     found: tuple[Answer, ...]
     notes: tuple[str, ...] = field(default=())
+    rooms: tuple[RoomAnswer, ...] = field(default=())
     count: int | None = None
     probability: float | None = None
     colour: str | None = None
@@ -111,7 +147,8 @@ class Answers:
         if self.colour is not None:
             return self.colour
         if self.count is not None:
-            expected = sum(answer.probability for answer in self.found)
+            expected = sum(one.probability for one in self.found)
+            expected += sum(one.probability for one in self.rooms)
             return f"{self.count} (expected number: {expected:.1f})"
         if self.probability is None:
             return None
@@ -129,6 +166,8 @@ class Answers:
             "answers": [answer.to_dict() for answer in self.found],
             "notes": list(self.notes),
         }
+        if self.rooms:
+            values["rooms"] = [answer.to_dict() for answer in self.rooms]
         if self.count is not None:
             values["count"] = self.count
         if self.probability is not None:
@@ -174,6 +213,8 @@ def ask(graph: SceneGraph, question: str) -> Answers:
         return _seen_since(graph, question, asked)
     if isinstance(asked, Like):
         return _look_like(graph, question, asked)
+    if _is_room(graph, asked.thing):
+        return _ask_rooms(graph, question, asked)
     pattern, notes = _understood(graph, asked)
     items = graph.objects(pattern.thing, min_probability=MIN_PROBABILITY)
     if pattern.kind == "holds":
@@ -252,7 +293,10 @@ def _understood(graph: SceneGraph, asked: Pattern) -> tuple[Pattern, list[str]]:
     pattern = replace(
         asked,
         thing=meant(asked.thing),
-        conditions=tuple(replace(one, thing=meant(one.thing)) for one in asked.conditions),
+        conditions=tuple(
+            one if _is_in_room(graph, one) else replace(one, thing=meant(one.thing))
+            for one in asked.conditions
+        ),
         rank=None if rank is None else replace(rank, thing=meant(rank.thing)),
     )
     return pattern, list(notes)
@@ -397,6 +441,13 @@ def _best_part(
     if condition.point is not None:
         is_close = distance_m(item, condition.point) <= (condition.within_m or 0.0)
         return (1.0, None, f"within {condition.within_m:g} m") if is_close else None
+    if _is_in_room(graph, condition):
+        inside = [
+            (share * called, None, f"in {room.name}: {share:.0%}")
+            for room, called in _rooms_called(graph, condition.thing or "")
+            if (share := room.objects.get(item.id, 0.0)) > 0.0
+        ]
+        return max(inside, key=lambda part: part[0], default=None)
     budget.spend(1)
     best: dict[int, Relation] = {}
     if condition.predicate is None:
@@ -423,3 +474,83 @@ def _best_part(
         text = f"{said} {of}: {relation.probability:.0%}, {relation.evidence}"
         parts.append((counted_chance * relation.probability, relation, text))
     return max(parts, key=lambda part: part[0], default=None)
+
+
+# --- Rooms: "cup in the kitchen", "rooms next to the hall", "bedrooms with a desk".
+
+_IN = frozenset({"in", "inside"})
+_NEXT_TO = frozenset({"near", "with", "has"})
+
+
+def _is_room(graph: SceneGraph, name: str | None) -> bool:
+    """Whether a name is a kind of room, "room 2", or the name of a room, and no object's."""
+    if name is None or any(is_class(name, label) for label in graph.labels):
+        return False
+    words = room_words(name)
+    known = graph.rooms if isinstance(graph.message.rooms, list) else ()
+    return (
+        room_kind(name) is not None
+        or words[:1] in ([UNNAMED_ROOM], [f"{UNNAMED_ROOM}s"])
+        or any(room.is_named_by_hand and room_words(room.label) == words for room in known)
+    )
+
+
+def _is_in_room(graph: SceneGraph, condition: Condition) -> bool:
+    return condition.predicate in _IN and _is_room(graph, condition.thing)
+
+
+def _rooms_called(graph: SceneGraph, name: str) -> list[tuple[Room, float]]:
+    """The rooms with a name; ClientError if there are no rooms at all."""
+    if not graph.rooms:
+        raise ClientError(f"'{name}': rooms of this graph: {NO_ROOMS}")
+    return graph.rooms.called(name)
+
+
+def _ask_rooms(graph: SceneGraph, question: str, asked: Pattern) -> Answers:
+    """The rooms that fulfil a pattern: next to a room, by a doorway, or with an object in them."""
+    found = []
+    for room, chance in _rooms_called(graph, asked.thing or UNNAMED_ROOM):
+        words = [f"{asked.thing} {chance:.0%}, {room.area_m2:.0f} m²"]
+        for condition in asked.conditions:
+            share, text = _part_of_room(graph, room, condition, question)
+            share = 1.0 - share if condition.is_negated else share
+            chance *= share
+            words.append(f"{'not ' * condition.is_negated}{text} ({share:.0%})")
+        if chance >= MIN_PROBABILITY:
+            found.append(RoomAnswer(room, chance, "; ".join(words)))
+    found.sort(key=lambda answer: (-answer.probability, answer.room.id))
+    notes = [] if found else [f"no room fulfils this with {MIN_PROBABILITY:.0%} or more"]
+    chances = [answer.probability for answer in found]
+    return Answers(
+        question,
+        (),
+        tuple(notes),
+        tuple(found),
+        count=sum(chance >= 0.5 for chance in chances) if asked.kind == "count" else None,
+        probability=1.0 - math.prod(1.0 - chance for chance in chances)
+        if asked.kind in ("exists", "holds")
+        else None,
+    )
+
+
+def _part_of_room(
+    graph: SceneGraph, room: Room, condition: Condition, question: str
+) -> tuple[float, str]:
+    """The probability that a condition holds for a room, and what fulfils it best."""
+    if condition.predicate not in _NEXT_TO or condition.thing is None:
+        raise ClientError(
+            f"question '{question}': '{_words(condition)}' is no condition of a room; expected "
+            "'next to' and a room, or 'with' and an object"
+        )
+    if _is_room(graph, condition.thing):
+        near = {door.to for door in room.doorways}
+        rooms = [pair for pair in _rooms_called(graph, condition.thing) if pair[0].id in near]
+        best = max(rooms, key=lambda pair: pair[1], default=None)
+        return (0.0, _words(condition)) if best is None else (best[1], f"next to {best[0].name}")
+    thing = graph.understand(condition.thing).meant
+    inside = [graph[node_id] for node_id in room.objects if node_id in graph]
+    parts = [
+        (chance * of_colour * room.objects[item.id], f"with {item.name}")
+        for item, chance, of_colour in _things(inside, thing, condition.colour)
+    ]
+    return max(parts, key=lambda part: part[0], default=(0.0, f"with {thing}"))

@@ -64,7 +64,15 @@ class Undo(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Undo the newest edit that was not undone yet, of any user."""
 
 
+class NameRoom(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A room is called so, whatever is in it; an empty name takes that back. `Undo` does not."""
+
+    room: wire.NodeId
+    name: Annotated[str, msgspec.Meta(max_length=MAX_NAME_CHARACTERS, pattern=LABEL_PATTERN)]
+
+
 EditRequest = Union[SetLabel, MergeNodes, SplitNode, DeleteNode, Undo]
+GraphEdit = Union[EditRequest, NameRoom]
 
 
 class Edit(msgspec.Struct, frozen=True):

@@ -51,6 +51,10 @@ SAME_COS = math.cos(math.radians(15.0))
 # masks and depth are wrong in some. It may also go on if as many frames show the object beyond it
 # as show something else there.
 MIN_CUT, MAX_SEEN = 2, 0.1
+# An object rests on what at least MIN_RESTS of the last RESTS frames show, less than `BEYOND_M`
+# below its points: masks end a little above. A frame counts if it shows it below at least MIN_BELOW
+# points.
+MIN_RESTS, RESTS, MIN_BELOW = 3, 9, 3
 # Weights of points with these many points around.
 _EVEN_WEIGHTS = np.append(0.0, np.arange(1.0, 4097.0) ** -0.5)
 # Headings of a box, over 90 degrees. The smallest rectangle around two sides of a cabinet lies
@@ -273,6 +277,7 @@ class _Ends:
         counts: (3, 2, 3), by axis and end: frames that show what is beyond, that do not, and in
             which the object goes on.
         due: number of observations of the node from which on it is measured again.
+        rests_m: heights along the third axis, from the origin, of what frames show just below.
     """
 
     center: Float64
@@ -280,6 +285,7 @@ class _Ends:
     axes: Float64
     counts: Int64
     due: int = 0
+    rests_m: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, box: wire.GravityBox) -> _Ends:
@@ -287,6 +293,20 @@ class _Ends:
         axes = _axes_of(tuple(box.orientation_xyzw))
         half = np.array(box.size_m) / 2.0
         return cls(np.array(box.center_m), half, axes, np.zeros((3, 2, 3), np.int64))
+
+    def on_its_rest(self, box: wire.GravityBox) -> wire.GravityBox:
+        """A box of the node down to what it rests on; as it is if that is not known or not near."""
+        if len(self.rests_m) < MIN_RESTS:
+            return box
+        center, size = np.array(box.center_m), list(box.size_m)
+        rest_m = float(np.median(self.rests_m))
+        gap_m = round(float(self.axes[2] @ center) - size[2] / 2 - rest_m, BOX_DECIMALS)
+        if not 0 < gap_m <= BEYOND_M:
+            return box
+        center -= 0.5 * gap_m * self.axes[2]
+        size[2] = round(size[2] + gap_m, BOX_DECIMALS)
+        center_m = rounded(center, POSITION_DECIMALS)
+        return msgspec.structs.replace(box, center_m=center_m, size_m=size)
 
     def shared(self, other: _Ends) -> Bool:
         """Which ends (3, 2) of another box are those of this one, too."""
@@ -322,7 +342,7 @@ class NodeBoxes:
                 ends.axes = ends.axes @ T[:3, :3].T
 
     def followed(self, node_id: int, box: wire.GravityBox) -> wire.GravityBox:
-        """The box of a node, with the sides that may go on."""
+        """The box of a node, down to what it rests on, with the sides that may go on."""
         known, sides = self._ends.get(node_id), UNSET
         if known is not None:
             seen, cut, on = known.counts.transpose(2, 0, 1)
@@ -332,7 +352,9 @@ class NodeBoxes:
                 open_ &= known.shared(_Ends.of(box))
             if open_.any():
                 sides = open_.any(axis=1).tolist()
-        return box if sides == box.at_least else msgspec.structs.replace(box, at_least=sides)
+        if sides != box.at_least:
+            box = msgspec.structs.replace(box, at_least=sides)
+        return box if known is None else known.on_its_rest(box)
 
     def observe(
         self, local: LocalGraph, node_ids: Sequence[int], up_world: Callable[[], Float64]
@@ -360,7 +382,7 @@ class NodeBoxes:
         beyond = points[places] + BEYOND_M * _SIGNS[at, None] * axes[places, sides]
         bears = (sides == 2) & (at == 0)
         values = local.instance_ids[rows][of[places]]
-        seen = _seen_beyond(local, grid, points[places], beyond, bears, values)
+        *seen, way = _seen_beyond(local, grid, points[places], beyond, bears, values)
         size = 6 * len(rows)
         cells = 6 * of[places] + 2 * sides + at
         total = np.maximum(np.bincount(cells, minlength=size), 1)
@@ -368,6 +390,18 @@ class NodeBoxes:
         shown, cut, goes_on = np.reshape(parts, (3, len(rows), 3, 2))
         for ends, *kinds in zip(known, shown & ~goes_on, cut & ~shown & ~goes_on, goes_on):
             ends.counts += np.stack(kinds, axis=2)
+        # Where the rays to the places below the objects end, above the origin.
+        below = bears & seen[0]
+        camera = local.T_world_camera[:3, 3]
+        ends_at = camera + way[below, None] * (beyond[below] - camera)
+        up = axes[places[below], 2]
+        heights_m = (up * ends_at).sum(axis=1)
+        drops_m = (up * points[places[below]]).sum(axis=1) - heights_m
+        near_below = (drops_m > -BEFORE_M) & (drops_m <= BEYOND_M)
+        rows_below, heights_m = of[places[below]][near_below], heights_m[near_below]
+        for row in np.flatnonzero(np.bincount(rows_below, minlength=1) >= MIN_BELOW):
+            rest_m = float(np.median(heights_m[rows_below == row]))
+            known[row].rests_m = (*known[row].rests_m, rest_m)[-RESTS:]
 
     def _measure(self, node_ids: Sequence[int], up_world: Callable[[], Float64]) -> None:
         """Measure the boxes of nodes anew that have been observed often enough since."""
@@ -387,7 +421,9 @@ class NodeBoxes:
             ends, node_id = _Ends.of(extent.box), int(nodes.ids[slot])
             known, count = self._ends.get(node_id), int(nodes.observations[slot])
             if known is not None:
-                ends.counts = known.counts * known.shared(ends)[:, :, None]
+                shared = known.shared(ends)
+                ends.counts = known.counts * shared[:, :, None]
+                ends.rests_m = known.rests_m if shared[2, 0] else ()
             wait = min(max(int(AGAIN_FRACTION * count), LEAST_FRAMES), MOST_FRAMES)
             ends.due, self._ends[node_id] = count + wait, ends
         if len(self._ends) > 2 * len(nodes) + FEW_POINTS:
@@ -401,10 +437,11 @@ def _seen_beyond(
     beyond: Float64,
     bears: Bool,
     values: Int64,
-) -> tuple[Bool, Bool, Bool]:
+) -> tuple[Bool, Bool, Bool, Float64]:
     """Whether a frame shows what is beyond points (n, 3), hides it, or shows more of the object.
 
-    Each (n,) bool. None of them: there is no depth, or the object before or behind.
+    Each (n,) bool. None of them: there is no depth, or the object before or behind. The last (n,)
+    is what the depth image shows there: its distance, as a part of that of the place beyond.
 
     Args:
         local: the frame, and
@@ -430,7 +467,8 @@ def _seen_beyond(
     shown = inside & known & ~hidden & (grid.instances[at] != values)
     own = inside & known & (grid.instances[at] == values)
     own &= np.abs(depth_m - z) <= BEFORE_M + BEFORE_FRACTION * ahead
-    return np.asarray(shown), np.asarray(~inside | (known & hidden)), np.asarray(own)
+    cut = ~inside | (known & hidden)
+    return np.asarray(shown), np.asarray(cut), np.asarray(own), np.asarray(depth_m / ahead)
 
 
 @kernel

@@ -97,8 +97,8 @@ def floor_plan(
     free: UInt8 = np.zeros((rows, columns), np.uint8)
     band = floor + LOWEST_M, floor + height_m
     for depth_mm, _, intrinsics, pose in space.views():
-        rays = _rays(intrinsics, depth_mm.shape) @ (axes @ pose[:3, :3]).T
-        for fan in _fans(axes @ pose[:3, 3], rays, 1e-3 * depth_mm.astype(np.float64), band):
+        rays = rays_of(intrinsics, depth_mm.shape) @ (axes @ pose[:3, :3]).T
+        for fan in fans(axes @ pose[:3, 3], rays, 1e-3 * depth_mm.astype(np.float64), band):
             cv2.fillPoly(free, [np.floor((fan - corner) / cell_m).astype(np.int32)], 1)
     cells = np.full((rows, columns), UNKNOWN, np.int8)
     cells[free > 0] = FREE
@@ -136,7 +136,7 @@ def floor_height_m(heights: Float32, upward: Float64) -> float:
     return float(np.median(above[inside])) if inside.any() else low
 
 
-def _rays(intrinsics: Float64, shape: tuple[int, ...]) -> Float64:
+def rays_of(intrinsics: Float64, shape: tuple[int, ...]) -> Float64:
     """Rays (h, w, 3) through the pixels of an image, camera frame, z = 1."""
     fx, fy, cx, cy = intrinsics
     height, width = shape
@@ -144,7 +144,7 @@ def _rays(intrinsics: Float64, shape: tuple[int, ...]) -> Float64:
     return np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), axis=2)
 
 
-def _fans(
+def fans(
     camera: Float64, rays: Float64, hits: Float64, band: tuple[float, float]
 ) -> Iterable[Float64]:
     """The areas (n, 2) that rays pass within the heights `band`, for each row of an image.

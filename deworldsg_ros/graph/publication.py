@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 import msgspec
+from msgspec import UNSET
 
 from deworldsg_ros.graph.extent import NodeBoxes
 from deworldsg_ros.graph.graph import GlobalGraph
@@ -67,6 +68,9 @@ class Publication:
         self._known_edges: dict[Pair, wire.EdgeState] = {}
         self._touched_nodes: set[int] = set()
         self._touched_edges: set[Pair] = set()
+        # Rooms and storeys, and whether clients do not have them yet.
+        self._rooms: tuple[wire.Rooms, wire.Storeys] = UNSET, UNSET
+        self._new_rooms = False
         # The head of the last update; the snapshot gets its nodes and edges when it is asked for.
         self._updated = self._snapshot = empty_scene_graph(graph.frame_id)
 
@@ -78,6 +82,11 @@ class Publication:
     def set_up(self, up_world: Float64) -> None:
         """Set the direction against gravity (3,)."""
         self._nodes.set_up(up_world)
+
+    def set_rooms(self, rooms: list[wire.RoomState], floors_m: list[float]) -> None:
+        """Set the rooms and the heights of the floors."""
+        self._new_rooms |= self._rooms != (rooms, floors_m)
+        self._rooms = rooms, floors_m
 
     @property
     def waiting(self) -> int:
@@ -95,7 +104,7 @@ class Publication:
         nodes, gone_nodes = _take(self._touched_nodes, self._known_nodes, self._touched_states())
         edges, gone_edges = _take(self._touched_edges, self._known_edges, self._edges)
         removed = self._graph.take_removals()
-        if not (nodes or edges or gone_nodes or gone_edges or removed):
+        if not (nodes or edges or gone_nodes or gone_edges or removed or self._new_rooms):
             return None
         # A live node that was hidden is removed from the snapshot. Clients know ids that no
         # snapshot contained from associations.
@@ -114,6 +123,9 @@ class Publication:
             associations=list(self._associations),
             up=self._updated.up,
         )
+        if self._new_rooms:
+            message.rooms, message.storeys_m = self._rooms
+            self._new_rooms = False
         self._associations.clear()
         return message
 
@@ -158,6 +170,8 @@ class Publication:
             nodes=nodes,
             edges=edges,
             up=list(self._nodes.up),
+            rooms=self._rooms[0],
+            storeys_m=self._rooms[1],
         )
 
 

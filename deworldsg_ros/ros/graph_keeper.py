@@ -19,6 +19,7 @@ from deworldsg_ros.base.words import counted
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph.embeddings import embeddings_path, write_embeddings
 from deworldsg_ros.graph.provenance import path_beside, space_path, write_seen, write_space
+from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.map_file import (
     RESERVED_IDS,
@@ -32,7 +33,13 @@ from deworldsg_ros.map_file import (
     write_map,
     write_state,
 )
-from deworldsg_ros.ros.graph_output import EmbeddingTopic, MakeMarkers, RoomTopics, WholeGraph
+from deworldsg_ros.ros.graph_output import (
+    EmbeddingTopic,
+    MakeMarkers,
+    RoomFinder,
+    RoomTopics,
+    WholeGraph,
+)
 from deworldsg_ros.ros.health import HIDDEN
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.options import Parameters
@@ -382,6 +389,9 @@ class GraphKeeper:
         self._whole = WholeGraph(node, markers)
         self._embeddings = EmbeddingTopic(node)
         self._room = RoomTopics(node)
+        self._rooms = RoomFinder(
+            node, lambda *found: self.submit(lambda: self._set_rooms(*found), lambda: None)
+        )
         self.files = GraphFiles(node)
         # None until a map or the first local graph gives the world frame and the vocabulary.
         continued = self.files.continued_map()
@@ -424,6 +434,7 @@ class GraphKeeper:
         ended = self._worker.stop()
         self._whole.close()
         self._room.close()
+        self._rooms.close()
         self.files.close(self._builder, busy=not ended)
 
     def problems(self) -> list[str]:
@@ -506,6 +517,18 @@ class GraphKeeper:
         self._builder.add_evidence(evidence)
         self._times.changed(self._running_s, time.monotonic(), can_wait=True)
 
+    def _set_rooms(
+        self,
+        builder: GraphBuilder,
+        before: RoomMap,
+        rooms: RoomMap,
+        states: list[wire.RoomState],
+    ) -> None:
+        """Take rooms that were found, unless the graph or a name is another one now."""
+        if builder is self._builder and builder.rooms is before:
+            builder.set_rooms(rooms, states)
+            self._times.changed(self._running_s, time.monotonic(), can_wait=True)
+
     def _correct(self, correct: Correct) -> None:
         assert self._builder is not None
         change = correct(self._builder.trail)
@@ -535,7 +558,12 @@ class GraphKeeper:
             self._embeddings.publish(self._builder, self._session, now_s)
         with self._node.refusing():
             self._room.publish(self._builder, now_s)
-        parts = (self._times, self._whole, self.files, self._embeddings, self._room)
+        with self._node.refusing():
+            self._rooms.look(self._builder, now_s)
+        parts = (
+            *(self._times, self._whole, self.files),
+            *(self._embeddings, self._room, self._rooms),
+        )
         waits = (part.wait_s(now_s) for part in parts)
         return min((wait_s for wait_s in waits if wait_s is not None), default=None)
 

@@ -24,6 +24,7 @@ from deworldsg_ros.graph.embeddings import embeddings_message
 from deworldsg_ros.graph.extent import DEFAULT_UP
 from deworldsg_ros.graph.floor_plan import FloorPlan, floor_plan
 from deworldsg_ros.graph.provenance import SeenSpace
+from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.graph.surface import Surface, SurfaceOfSpace, objects_at
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.ros.node import StageNode
@@ -341,6 +342,67 @@ class RoomTopics:
                     self._plan.publish(occupancy_grid(plan, snapshot.frame_id, stamp))
         now_s = time.monotonic()
         self._due_s = max(self._due_s, now_s + (now_s - started_s) / MAX_SHARE)
+
+
+# --- Rooms, found in the background.
+
+# A change of the views or of the objects is in the rooms after this time, or later: they cost at
+# most `ROOMS_SHARE` of a core.
+ROOMS_PERIOD_S, ROOMS_SHARE = 5.0, 0.05
+
+
+class RoomFinder:
+    """Finds the rooms of a graph anew when its views or its objects have changed.
+
+    Args:
+        node: counts errors.
+        found: called in the thread of this, with the graph, the rooms that it had, and the new
+            ones with their messages.
+    """
+
+    def __init__(
+        self,
+        node: StageNode,
+        found: Callable[[GraphBuilder, RoomMap, RoomMap, list[wire.RoomState]], None],
+    ) -> None:
+        self._node, self._found = node, found
+        self._due_s, self._is_needed = 0.0, False
+        # Of what the rooms were found in last.
+        self._known: tuple[Any, Any, int] = None, None, -1
+        self._worker: Worker[tuple[GraphBuilder, SeenSpace | None, Any]] = Worker(
+            "rooms", self._work, size=1, on_overrun=lambda job: None
+        )
+
+    def wait_s(self, now_s: float) -> float | None:
+        """Seconds until `look` looks again, 0 = now; None for a graph without views."""
+        return max(0.0, self._due_s - now_s) if self._is_needed else None
+
+    def look(self, builder: GraphBuilder | None, now_s: float) -> None:
+        """Begin to find the rooms if it is time and something has changed."""
+        self._is_needed = builder is not None and builder.has_rooms
+        if builder is None or not self._is_needed or now_s < self._due_s:
+            return
+        self._due_s = now_s + ROOMS_PERIOD_S
+        space, snapshot = copy(builder.space), builder.snapshot()  # neither changes any more
+        is_same = space.stamps_ns is self._known[0] and space.poses is self._known[1]
+        if (is_same and snapshot.sequence == self._known[2]) or not self._worker.wait_idle(0.0):
+            return
+        self._known = space.stamps_ns, space.poses, snapshot.sequence
+        self._worker.submit((builder, None if is_same else space, snapshot))
+
+    def close(self) -> None:
+        """End the thread."""
+        self._worker.stop()
+
+    def _work(self, job: tuple[GraphBuilder, SeenSpace | None, Any]) -> None:
+        started_s, (builder, space, snapshot) = time.monotonic(), job
+        before = builder.rooms
+        with self._node.refusing():
+            up = snapshot.up if isinstance(snapshot.up, list) else DEFAULT_UP
+            rooms = before if space is None else before.found_in(space, up)
+            self._found(builder, before, rooms, rooms.states(snapshot.nodes))
+        now_s = time.monotonic()
+        self._due_s = max(self._due_s, now_s + (now_s - started_s) / ROOMS_SHARE)
 
 
 # --- The whole graph on /scene_graph and as markers, slowly and in the background.

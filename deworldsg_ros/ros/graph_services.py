@@ -24,7 +24,15 @@ from deworldsg_ros.base.files import parse_json
 from deworldsg_ros.client.goals import Goal, Robot
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.questions import ask
-from deworldsg_ros.graph.edits import DeleteNode, EditRequest, MergeNodes, SetLabel, SplitNode, Undo
+from deworldsg_ros.graph.edits import (
+    DeleteNode,
+    GraphEdit,
+    MergeNodes,
+    NameRoom,
+    SetLabel,
+    SplitNode,
+    Undo,
+)
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map
 from deworldsg_ros.ros.graph_keeper import GraphKeeper
@@ -32,7 +40,7 @@ from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.threads import Worker
 from deworldsg_ros.scene.errors import DeWorldSGError, RefusedInput
-from deworldsg_ros.wire.messages import Point
+from deworldsg_ros.wire.fields import Point
 
 GOAL_TOPIC = "deworldsg/goal"
 # A question is a line. An edit is a few numbers.
@@ -114,6 +122,7 @@ class GraphServices:
             ("merge", MergeNodes, self._edit),
             ("split", SplitNode, self._edit),
             ("delete", DeleteNode, self._edit),
+            ("name_room", NameRoom, self._edit),
         )
         for name, kind, answer in services:
             self._serve(name, AddDiagnostics, partial(self._parsed, kind, answer))
@@ -236,7 +245,7 @@ class GraphServices:
         graph.space = self._builder.space
         return _json(graph.explain(what).to_dict())
 
-    def _edit(self, request: EditRequest) -> str:
+    def _edit(self, request: GraphEdit) -> str:
         reply = self._builder.edit(request)
         self._graph.changed()
         return _json(reply)

@@ -29,6 +29,8 @@ MAX_INSTANCE = 2**16 - 1
 # Objects of a frame. Perception keeps at most 50; this leaves room for other detectors. Matching
 # 256 objects takes a second at most.
 MAX_OBJECTS = 256
+# Rooms of a graph: those of a large office building.
+MAX_ROOMS = 1000
 # Relations of a frame: the largest value of `perception.max_relations`.
 MAX_RELATIONS = 1000
 # Neighbour pairs of a frame: each ordered pair of its objects.

@@ -20,7 +20,7 @@ import msgspec
 from deworldsg_ros.base.files import check_regular
 from deworldsg_ros.client.boxes import box_of
 from deworldsg_ros.client.changes import MOVED_M, MOVED_PART
-from deworldsg_ros.client.objects import Point
+from deworldsg_ros.client.objects import Point, Room
 from deworldsg_ros.scene.errors import StoreError
 from deworldsg_ros.wire import messages as wire
 
@@ -178,7 +178,7 @@ def _refusal(problem: str) -> StoreError:
 # Labels and names only ever enter a statement as parameters.
 
 # Of the tables below. A database of another version is made anew from the messages.
-VERSION = 1
+VERSION = 2
 # The database uses less memory if the graph is small.
 BUFFER_BYTES = 1 << 30
 # A question that takes longer is ended, and so is one with more rows.
@@ -202,6 +202,9 @@ _RELATION = {
     "probability": "DOUBLE",
     "provenance": "STRING",
     "observations": "INT64",
+}
+_ROOM = {"id": "INT64", "label": "STRING", "probability": "DOUBLE", "storey": "INT64"} | {
+    name: "DOUBLE" for name in ("area_m2", "x", "y", "z")
 }
 _STAY = {"key": "INT64", "id": "INT64", "label": "STRING", **_BOX} | {
     name: "INT64" for name in ("since_ns", "until_ns")
@@ -341,12 +344,37 @@ class Database:
         self, nodes: Mapping[int, wire.NodeState], edges: Iterable[wire.EdgeState]
     ) -> None:
         """Replace all objects and relations. A relation without both of its objects is left out."""
-        for table in ("Relation", "Object"):
+        for table in ("Relation", "Inside", "Doorway", "Object", "Room"):
             self.run(f"DROP TABLE {table}")
         self._make_graph_tables()
         self._copy("Object", _OBJECT, nodes.values(), _object_row)
         related = (edge for edge in edges if edge.subject in nodes and edge.object in nodes)
         self._copy("Relation", {**_ENDS, **_RELATION}, related, _edge_row)
+
+    def replace_rooms(self, rooms: Iterable[Room]) -> None:
+        """Replace all rooms, their doorways, and which objects are inside of them."""
+        self.run("MATCH (r:Room) DETACH DELETE r")
+        rooms = list(rooms)
+        rows = [dict(zip(_ROOM, _room_row(room))) for room in rooms]
+        self._each(_creation("Room", _ROOM), rows)
+        self._each(
+            "MATCH (o:Object {id: row.node}) WITH o, row MATCH (r:Room {id: row.room}) "
+            "CREATE (o)-[:Inside {probability: row.share}]->(r)",
+            [
+                {"node": node_id, "room": room.id, "share": share}
+                for room in rooms
+                for node_id, share in room.objects.items()
+            ],
+        )
+        self._each(
+            "MATCH (a:Room {id: row.a}) WITH a, row MATCH (b:Room {id: row.b}) "
+            "CREATE (a)-[:Doorway {width_m: row.width_m}]->(b)",
+            [
+                {"a": room.id, "b": door.to, "width_m": door.width_m}
+                for room in rooms
+                for door in room.doorways
+            ],
+        )
 
     def remove(self, nodes: Iterable[int], edges: Iterable[tuple[int, int]]) -> None:
         """Remove relations, and objects with theirs; those that are not there are no error."""
@@ -386,6 +414,9 @@ class Database:
     def _make_graph_tables(self) -> None:
         self.run(f"CREATE NODE TABLE Object({_typed(_OBJECT)}, PRIMARY KEY (id))")
         self.run(f"CREATE REL TABLE Relation(FROM Object TO Object, {_typed(_RELATION)})")
+        self.run(f"CREATE NODE TABLE Room({_typed(_ROOM)}, PRIMARY KEY (id))")
+        self.run("CREATE REL TABLE Inside(FROM Object TO Room, probability DOUBLE)")
+        self.run("CREATE REL TABLE Doorway(FROM Room TO Room, width_m DOUBLE)")
 
     def _each(self, cypher: str, rows: Sequence[Mapping[str, Any]]) -> None:
         if rows:
@@ -533,6 +564,10 @@ def _object_row(node: wire.NodeState, name: _Name) -> _Row:
     return (
         node.id, name(node.label), share * existence, *center, *size, node.observations, first, last
     )  # fmt: skip
+
+
+def _room_row(room: Room) -> _Row:
+    return room.id, room.label, room.probability, room.storey, room.area_m2, *room.center_m
 
 
 def _edge_row(edge: wire.EdgeState, name: _Name) -> _Row:

@@ -17,6 +17,7 @@ import msgspec
 from deworldsg_ros.base.files import FileLock, check_regular, paused_collector
 from deworldsg_ros.base.words import stamp_ns_from_text
 from deworldsg_ros.client.meanings import is_class
+from deworldsg_ros.client.objects import Rooms
 from deworldsg_ros.graph.graph_files import MAX_GRAPH_BYTES, read_content
 from deworldsg_ros.scene.errors import RefusedInput, StoreError
 from deworldsg_ros.store.database import (
@@ -175,6 +176,7 @@ class Batch:
         self._changed = self._is_whole = False
         self._nodes: dict[int, wire.NodeState | None] = {}
         self._edges: dict[tuple[int, int], wire.EdgeState | None] = {}
+        self._rooms: Rooms | None = None
 
     def follows(self, message: GraphMessage) -> bool:
         """Whether a message is the next one; False if it is known. Raises as `StoreWriter.add`."""
@@ -210,7 +212,7 @@ class Batch:
         removed = set()
         if self._begins(message):
             self._is_whole = True
-            self._nodes, self._edges = {}, {}
+            self._nodes, self._edges, self._rooms = {}, {}, Rooms()
             removed = set(self._history.current) - {node.id for node in message.nodes}
         if isinstance(message, wire.SceneGraphUpdateMessage):
             removed.update(node.id for node in message.removed_nodes)
@@ -223,6 +225,8 @@ class Batch:
             self._history.see(node, stamp_ns)
             self._nodes[node.id] = node
         self._edges.update(zip(map(attrgetter("subject", "object"), message.edges), message.edges))
+        if isinstance(message.rooms, list):
+            self._rooms = Rooms.of_message(message.rooms)
         self.head = Head(
             self.head.position,
             stamp_ns,
@@ -247,6 +251,8 @@ class Batch:
             changed = [node for i, node in nodes.items() if i in self._stored]
             database.put(new, changed, edges)
             self._stored = (self._stored - gone) | nodes.keys()
+        if self._rooms is not None:
+            database.replace_rooms(self._rooms)
         database.put_stays(*self._history.take())
         database.write_head(replace(self.head))
 
@@ -375,7 +381,7 @@ class Store:
         Each question has a process of its own, which takes most of a second to start.
 
         Args:
-            cypher: with the tables Object, Relation and Stay (docs/store.md).
+            cypher: with the tables of docs/store.md.
             parameters: values of its ``$names``.
 
         Raises:

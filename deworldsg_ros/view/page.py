@@ -18,7 +18,7 @@ import numpy as np
 
 from deworldsg_ros.base.files import write_atomically
 from deworldsg_ros.client.explain import explain_relation
-from deworldsg_ros.client.objects import SceneObject, relation_of, scene_object
+from deworldsg_ros.client.objects import SURE, Rooms, SceneObject, relation_of, scene_object
 from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.graph.surface import Surface, surface_of
@@ -116,6 +116,7 @@ def content_of(
     }
     edges = sorted(drawable_edges(graph), key=lambda edge: -edge.probability)
     hidden = graph.hidden if isinstance(graph.hidden, list) else []
+    rooms = graph.rooms if isinstance(graph.rooms, list) else []
     path = np.zeros((0, 3)) if camera_path_world is None else np.asarray(camera_path_world)
     path = path[:: max(1, -(-len(path) // MOST_PATH_POINTS))].reshape(-1, 3)
     clouds = {node.id: surface_points(node) for node in graph.nodes}
@@ -125,6 +126,7 @@ def content_of(
             **colours_of(items.values(), edges),
             "frame_id": graph.frame_id,
             "hidden": Counter(node.reason for node in hidden),
+            "rooms": room_values(rooms, axes_of_view),
         },
         "nodes": [values_of(item, axes_of_view) for item in items.values()],
         "edges": [
@@ -230,6 +232,20 @@ def surface_values(
         "rgb": base64.b64encode(colours.tobytes()).decode(),
         "sides": base64.b64encode(np.round(turned).astype(np.int8).tobytes()).decode(),
     }
+
+
+def room_values(states: Iterable[wire.RoomState], axes_of_view: Float64) -> list[dict[str, Any]]:
+    """The outlines of rooms, their names, and the objects in them."""
+    return [
+        {
+            "id": room.id,
+            "name": room.name,
+            "sure": room.probability >= SURE,
+            "outline": path_values(np.array(room.outline_m).reshape(-1, 3), axes_of_view),
+            "objects": [[node_id, share] for node_id, share in room.objects.items()],
+        }
+        for room in Rooms.of_message(states)
+    ]
 
 
 def path_values(positions_world: Float64, axes_of_view: Float64) -> list[list[float]]:

@@ -38,9 +38,12 @@ def join(updates: Sequence[wire.SceneGraphUpdateMessage]) -> wire.SceneGraphUpda
     cut: dict[wire.RemovedEdge, None] = {}
     nodes: dict[int, wire.NodeState] = {}
     edges: dict[tuple[int, int], wire.EdgeState] = {}
+    rooms: tuple[Any, Any] = UNSET, UNSET
     for update in updates:
         if update.since == 0:
             since, gone, cut, nodes, edges = 0, {}, {}, {}, {}
+        if update.since == 0 or update.rooms is not UNSET:
+            rooms = update.rooms, update.storeys_m
         for removed in update.removed_nodes:
             gone[removed.id] = removed
             nodes.pop(removed.id, None)
@@ -57,6 +60,8 @@ def join(updates: Sequence[wire.SceneGraphUpdateMessage]) -> wire.SceneGraphUpda
         nodes=list(nodes.values()),
         edges=list(edges.values()),
         associations=[item for update in updates for item in update.associations],
+        rooms=rooms[0],
+        storeys_m=rooms[1],
     )
 
 
@@ -112,12 +117,18 @@ class GraphReplica:
         """Unit vector (3,) against gravity; None = the messages do not tell it."""
         return self._up if isinstance(self._up, list) else None
 
+    @property
+    def rooms(self) -> list[wire.RoomState]:
+        """The rooms; empty if the messages tell none."""
+        return self._rooms[0] if isinstance(self._rooms[0], list) else []
+
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
         """Replace the copy by a snapshot."""
         self._stamp = snapshot.stamp
         self._frame_id = snapshot.frame_id
         self._session = snapshot.session
         self._up = snapshot.up
+        self._rooms = snapshot.rooms, snapshot.storeys_m
         self._sequence = snapshot.sequence
         self._nodes = {node.id: node for node in snapshot.nodes}
         self._edges = {(edge.subject, edge.object): edge for edge in snapshot.edges}
@@ -158,6 +169,8 @@ class GraphReplica:
         self._stamp = update.stamp
         self._frame_id = update.frame_id
         self._up = update.up
+        if update.since == 0 or update.rooms is not UNSET:
+            self._rooms = update.rooms, update.storeys_m
         self._sequence = update.sequence
         return True
 
@@ -172,6 +185,8 @@ class GraphReplica:
             nodes=[self._nodes[node_id] for node_id in sorted(self._nodes)],
             edges=[self._edges[pair] for pair in sorted(self._edges)],
             up=self._up,
+            rooms=self._rooms[0],
+            storeys_m=self._rooms[1],
         )
 
 
@@ -205,6 +220,8 @@ class ChangeLog:
                 return
             if not is_known:
                 self._begin(graph.session, graph.sequence)
+            if self._graph is None or self._graph.rooms != graph.rooms:
+                self._new_rooms = graph.sequence
             self._graph, self._sequence = graph, graph.sequence
             nodes = {node.id: node for node in graph.nodes}
             edges = {(edge.subject, edge.object): edge for edge in graph.edges}
@@ -244,10 +261,12 @@ class ChangeLog:
                 edges=self._edges.changed(since),
                 associations=[],
                 up=graph.up,
+                rooms=graph.rooms if self._new_rooms > since else UNSET,
+                storeys_m=graph.storeys_m if self._new_rooms > since else UNSET,
             )
 
     def _begin(self, session: Any, sequence: int) -> None:
-        self._session, self._first = session, sequence
+        self._session, self._first, self._new_rooms = session, sequence, sequence
         self._nodes: _Parts[int] = _Parts()
         self._edges: _Parts[tuple[int, int]] = _Parts()
 

@@ -16,15 +16,9 @@ from deworldsg_ros.scene.limits import (
     MAX_COORDINATE_M,
     MAX_COST,
     MAX_EMBEDDING,
-    MAX_FOCAL_PX,
     MAX_FRAME_BYTES,
     MAX_GRAPH_BYTES,
-    MAX_GRAPH_COORDINATE_M,
-    MAX_GRAPH_VARIANCE_M2,
     MAX_INSTANCE,
-    MAX_INT,
-    MAX_LAB,
-    MAX_LOGIT,
     MAX_MASK_BYTES,
     MAX_NAME_CHARACTERS,
     MAX_NAMES,
@@ -33,108 +27,46 @@ from deworldsg_ros.scene.limits import (
     MAX_POINTS,
     MAX_REASON_CHARACTERS,
     MAX_RELATIONS,
+    MAX_ROOMS,
     MAX_SECONDS,
     MAX_SIDE_PX,
-    MAX_VARIANCE_M2,
     check_labels,
     checked_frame_id,
 )
+from deworldsg_ros.wire.fields import (
+    POINT_BYTES,
+    Box,
+    Colour,
+    Covariance,
+    Distribution,
+    Embedding,
+    Focal,
+    Height,
+    Logits,
+    Matrix3,
+    Model,
+    Name,
+    Names,
+    NonNegative,
+    Points,
+    Positive,
+    Probability,
+    RgbGrid,
+    Row,
+    Side,
+    Size3,
+    UnitPart,
+    Vector3,
+    Vector16,
+)
+from deworldsg_ros.wire.fields import NodeId as NodeId
+from deworldsg_ros.wire.fields import Point as Point
+from deworldsg_ros.wire.fields import Pose as Pose
 
 # A reader of version N reads N - 1 too. Version 2 of the graph added up, boxes, remainders, compact
 # surfaces and mutual edges; that of a local graph has compact surfaces.
 VERSION = 1
 VERSIONS = {"local_graph": 2, "scene_graph": 2, "scene_graph_updates": 2}
-
-NonNegative = Annotated[int, msgspec.Meta(ge=0, le=MAX_INT)]
-Positive = Annotated[int, msgspec.Meta(ge=1, le=MAX_INT)]
-NodeId = Annotated[int, msgspec.Meta(ge=1, le=MAX_INT)]
-# The sum of rounded probabilities may exceed 1 by some ulp.
-Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0 + 1e-9)]
-Distribution = Annotated[
-    list[Probability], msgspec.Meta(max_length=MAX_NAMES, description="sums to one")
-]
-Coordinate = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
-Point = Annotated[list[Coordinate], msgspec.Meta(min_length=3, max_length=3)]
-Points = Annotated[list[Point], msgspec.Meta(max_length=MAX_POINTS)]
-POINT_BYTES = 12
-Side = Annotated[int, msgspec.Meta(ge=1, le=MAX_SIDE_PX, description="pixels")]
-Pixel = Annotated[float, msgspec.Meta(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)]
-Focal = Annotated[float, msgspec.Meta(ge=-MAX_FOCAL_PX, le=MAX_FOCAL_PX)]
-Box = Annotated[
-    list[Pixel],
-    msgspec.Meta(
-        min_length=4, max_length=4, description="x1 y1 x2 y2, pixels; x1 <= x2 and y1 <= y2"
-    ),
-]
-Covariance = Annotated[
-    list[Annotated[float, msgspec.Meta(ge=-MAX_VARIANCE_M2, le=MAX_VARIANCE_M2)]],
-    msgspec.Meta(
-        min_length=9, max_length=9, description="3x3, row by row, symmetric, positive definite"
-    ),
-]
-Pose = Annotated[
-    list[Coordinate],
-    msgspec.Meta(
-        min_length=16, max_length=16, description="4x4, row by row, a rigid transform, metres"
-    ),
-]
-Logits = Annotated[
-    list[Annotated[float, msgspec.Meta(ge=-MAX_LOGIT, le=MAX_LOGIT)]],
-    msgspec.Meta(max_length=MAX_NAMES),
-]
-Name = Annotated[
-    str,
-    msgspec.Meta(max_length=MAX_NAME_CHARACTERS, description="without control characters"),
-]
-Colour = Annotated[
-    Union[
-        Annotated[
-            list[Annotated[float, msgspec.Meta(ge=-MAX_LAB, le=MAX_LAB)]],
-            msgspec.Meta(min_length=3, max_length=3),
-        ],
-        msgspec.UnsetType,
-    ],
-    msgspec.Meta(
-        description="mean colour of the surface, CIELAB (D65): L* a* b*; absent = unknown"
-    ),
-]
-# Values of half precision take two bytes.
-Vector16 = Annotated[
-    bytes,
-    msgspec.Meta(
-        max_length=2 * MAX_EMBEDDING,
-        description="vector of length 1, float16 little-endian, base64",
-    ),
-]
-Embedding = Annotated[
-    Union[Vector16, msgspec.UnsetType],
-    msgspec.Meta(description="what the image shows of the object; absent = not embedded"),
-]
-Model = Annotated[
-    Union[Name, msgspec.UnsetType],
-    msgspec.Meta(description="that made the embeddings; absent = there are none"),
-]
-# Of a scene graph, in metres.
-Vector3 = Annotated[
-    list[Annotated[float, msgspec.Meta(ge=-MAX_GRAPH_COORDINATE_M, le=MAX_GRAPH_COORDINATE_M)]],
-    msgspec.Meta(min_length=3, max_length=3),
-]
-Size3 = Annotated[
-    list[Annotated[float, msgspec.Meta(ge=0.0, le=2 * MAX_GRAPH_COORDINATE_M)]],
-    msgspec.Meta(min_length=3, max_length=3, description="along the box's axes, the third is up"),
-]
-Matrix3 = Annotated[
-    list[Annotated[float, msgspec.Meta(ge=-MAX_GRAPH_VARIANCE_M2, le=MAX_GRAPH_VARIANCE_M2)]],
-    msgspec.Meta(min_length=9, max_length=9, description="3x3, row by row"),
-]
-# Part of a direction or quaternion of unit length, which may be rounded.
-RgbGrid = Annotated[
-    bytes, msgspec.Meta(description="R, G, B of every 8th pixel, from the 4th on; base64; or empty")
-]
-UnitPart = Annotated[float, msgspec.Meta(ge=-1.01, le=1.01)]
-Names = Annotated[list[Name], msgspec.Meta(min_length=1, max_length=MAX_NAMES)]
-# Row of an object in the message of its frame.
-Row = Annotated[int, msgspec.Meta(ge=0, lt=MAX_OBJECTS)]
 
 
 # gc=False: a graph has millions of these, and none is in a cycle. The collector skips them.
@@ -504,6 +436,51 @@ class EdgeState(msgspec.Struct, frozen=True, gc=False):
     measured_m: Measured = msgspec.UNSET
 
 
+class Doorway(msgspec.Struct, frozen=True):
+    """A passage from one room to another."""
+
+    to: Annotated[NodeId, msgspec.Meta(description="id of the other room")]
+    position_m: Vector3
+    width_m: Annotated[float, msgspec.Meta(ge=0.0, le=100.0)]
+
+
+class RoomObject(msgspec.Struct, frozen=True):
+    """An object of a room, with the probability that it is in it."""
+
+    id: NodeId
+    probability: Probability
+
+
+class RoomState(msgspec.Struct, frozen=True):
+    """A room: a part of the free space that walls and doorways bound."""
+
+    id: Annotated[NodeId, msgspec.Meta(description="of rooms, not of objects; stable")]
+    label: Annotated[Name, msgspec.Meta(description="room, if no kind is probable enough")]
+    kinds: Annotated[
+        list[Belief], msgspec.Meta(max_length=MAX_NAMES, description="most probable first")
+    ]
+    storey: Annotated[NonNegative, msgspec.Meta(description="row in storeys_m")]
+    outline_m: Annotated[
+        list[Vector3], msgspec.Meta(max_length=MAX_POINTS, description="on its floor, in order")
+    ]
+    area_m2: Annotated[float, msgspec.Meta(ge=0.0, le=1e9)]
+    doorways: list[Doorway]
+    objects: list[RoomObject]
+    named: Annotated[bool, msgspec.Meta(description="false = the label is room")] = True
+    label_provenance: Annotated[
+        Union[Literal["operator"], msgspec.UnsetType],
+        msgspec.Meta(description="operator = named by hand; absent = by what it contains"),
+    ] = msgspec.UNSET
+
+
+Rooms = Annotated[
+    Union[Annotated[list[RoomState], msgspec.Meta(max_length=MAX_ROOMS)], msgspec.UnsetType],
+    msgspec.Meta(description="all rooms, some seconds old; absent = unchanged, or not known"),
+]
+Storeys = Annotated[
+    Union[Annotated[list[Height], msgspec.Meta(max_length=MAX_ROOMS)], msgspec.UnsetType],
+    msgspec.Meta(description="heights of the floors along up, the lowest first; with rooms"),
+]
 Up = Annotated[
     Union[Annotated[list[UnitPart], msgspec.Meta(min_length=3, max_length=3)], msgspec.UnsetType],
     msgspec.Meta(description="unit vector against gravity in the world frame"),
@@ -527,6 +504,8 @@ class SceneGraphMessage(Message, kw_only=True):
         Union[list[HiddenNode], msgspec.UnsetType],
         msgspec.Meta(description="in saved files only"),
     ] = msgspec.UNSET
+    rooms: Rooms = msgspec.UNSET
+    storeys_m: Storeys = msgspec.UNSET
 
 
 class RemovedNode(msgspec.Struct, frozen=True):
@@ -571,6 +550,8 @@ class SceneGraphUpdateMessage(Message, kw_only=True):
     edges: list[EdgeState]
     associations: list[Association]
     up: Up = msgspec.UNSET
+    rooms: Rooms = msgspec.UNSET
+    storeys_m: Storeys = msgspec.UNSET
 
 
 class NodeEmbedding(msgspec.Struct, frozen=True, gc=False):
@@ -674,6 +655,9 @@ def _check_graph(message: Union[SceneGraphMessage, SceneGraphUpdateMessage]) -> 
     labels.update(belief.label for beliefs in listed for belief in beliefs)
     if isinstance(message, SceneGraphMessage) and isinstance(message.hidden, list):
         labels.update(text for node in message.hidden for text in (node.label, node.reason))
+    rooms = message.rooms if isinstance(message.rooms, list) else []
+    labels.update(name for room in rooms for name in (room.label, *(k.label for k in room.kinds)))
+    _check_once("room", [room.id for room in rooms])
     check_labels(sorted(labels))
     if isinstance(message.up, list):
         _check_unit("up", message.up)

@@ -84,7 +84,7 @@ def test_an_installation_runs_the_installed_executables(tmp_path, monkeypatch):
     ("program", "while_importing", "exit_code"),
     [
         ("from deworldsg_ros.cli import main; main()", "typer", 130),
-        ("from deworldsg_ros.nodes.start import start; start('graph_node')", "rclpy", 0),
+        ("from deworldsg_ros.nodes import start; start('graph_node')", "rclpy", 0),
     ],
 )
 def test_ctrl_c_while_python_imports_is_quiet(tmp_path, program, while_importing, exit_code):

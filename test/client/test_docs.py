@@ -59,6 +59,8 @@ def page(root_dir, demo_out, monkeypatch):
     for stamp in range(1, 8):
         builder.integrate(view(stamp, (HERE, CUP)))
     builder.edit(SetLabel(1, "mug"))
+    builder.space = seen_room()
+    builder.find_rooms()
     write_map(builder, Path("room.map"))
     return blocks(root_dir / "docs" / "use_the_graph.md")
 
@@ -78,6 +80,19 @@ def test_the_python_of_the_page_runs(page):
     assert len(python) >= 7
     for block in python:
         exec(compile(block, "use_the_graph.md", "exec"), names)
+
+
+def test_the_section_about_rooms_runs(page, root_dir):
+    text = (root_dir / "docs" / "maps_that_last.md").read_text(encoding="utf-8")
+    (section,) = re.findall(
+        r"^## Rooms and storeys\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL
+    )
+    for language, block in BLOCK.findall(section):
+        if language == "python":
+            exec(compile(block, "maps_that_last.md", "exec"), {})
+            continue
+        for line in block.splitlines():
+            printed(*shlex.split(line, comments=True)[1:])
 
 
 def test_the_commands_of_the_page_run(page, monkeypatch):

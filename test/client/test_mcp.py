@@ -15,7 +15,8 @@ from deworldsg_ros.client.mcp_server import GraphTools, WatchedFile
 from deworldsg_ros.wire import messages as wire
 
 TOOLS = {
-    "list_objects", "list_relations", "find", "get_object_context", "what_changed", "goal_near",
+    "list_objects", "list_relations", "list_rooms", "find", "get_object_context", "what_changed",
+    "goal_near",
 }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from numpy.lib.recfunctions import repack_fields
 from support.merging import VOCABULARY, node_states, random_pose
 from support.surfaces import CAMERA, CUP, TABLE, frame
 
-from deworldsg_ros.config import Config, MergingConfig
+from deworldsg_ros.config import Config, InputsConfig, MergingConfig
 from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph_builder import GraphBuilder
@@ -377,3 +377,59 @@ def test_a_map_continues_the_evidence(tmp_path: Path) -> None:
     again = read_map(config, path)
     assert again.integrate(view(99, TRUE_M)) == [1]
     assert again.full().nodes[0].existence > 0.5
+
+
+# A crate on the ground, seen from 1 m above, 45 degrees downwards.
+CRATE_LOW, CRATE_HIGH = np.array([-0.15, 0.9, 0.0]), np.array([0.15, 1.2, 0.25])
+T_WORLD_CAMERA = np.eye(4)
+T_WORLD_CAMERA[:3, :3] = np.array(
+    [[1, 0, 0], [0, -(0.5**0.5), 0.5**0.5], [0, -(0.5**0.5), -(0.5**0.5)]]
+)
+T_WORLD_CAMERA[2, 3] = 1.0
+
+
+def crate_view(stamp: int, ground_m: float | None, mask_above_m: float = 0.02) -> LocalGraph:
+    """The crate, whose mask ends above its bottom, and the ground beneath it; None = no ground."""
+    rays = np.ones((*SHAPE, 3))
+    rays[..., 0] = (8 * (np.arange(SHAPE[1]) + 0.5) - CAMERA.cx) / CAMERA.fx
+    rays[..., 1] = ((8 * (np.arange(SHAPE[0]) + 0.5) - CAMERA.cy) / CAMERA.fy)[:, None]
+    rays = rays @ T_WORLD_CAMERA[:3, :3].T
+    camera = T_WORLD_CAMERA[:3, 3]
+    with np.errstate(divide="ignore"):
+        ends = np.sort(np.stack([CRATE_LOW - camera, CRATE_HIGH - camera])[:, None, None] / rays, 0)
+        enter, leave = ends[0].max(axis=2), ends[1].min(axis=2)
+        ground = (ground_m - camera[2]) / rays[..., 2] if ground_m is not None else 0 * enter
+    hits = (enter < leave) & (enter > 0)
+    depth_m = np.where(hits, enter, np.where((ground > 0) & (ground < 9), ground, 0.0))
+    points = camera + depth_m[..., None] * rays
+    mask = hits & (points[..., 2] > mask_above_m)
+    grid = DepthGrid(np.rint(1000 * depth_m).astype(np.uint16), 8, CAMERA, mask.astype(np.uint16))
+    # The faces that the camera sees, at all pixels and not only those of the grid.
+    part = np.random.default_rng(stamp).uniform(size=(900, 3))
+    part[:450, 1], part[450:, 2] = 0.0, 1.0
+    low = np.array([*CRATE_LOW[:2], mask_above_m])
+    surface = (low + part * (CRATE_HIGH - low)).astype(np.float32)
+    return frame(stamp, (surface, TABLE), T_world_camera=T_WORLD_CAMERA, depth_grid=grid)
+
+
+@pytest.mark.parametrize(
+    ("ground_m", "bottom_m"),
+    [
+        (0.0, 0.0),
+        # No ground near below, as of a crate on a wall: what is seen there is the crate itself.
+        (None, 0.015),
+        (-0.5, 0.015),
+    ],
+)
+def test_a_box_reaches_down_to_what_is_seen_beneath(
+    ground_m: float | None, bottom_m: float
+) -> None:
+    builder = GraphBuilder(Config(inputs=InputsConfig(world_up="z")), VOCABULARY, "world")
+    for stamp in range(1, 9):
+        builder.integrate(crate_view(stamp, ground_m))
+    (node,) = builder.full().nodes
+    low_m = node.box.center_m[2] - node.box.size_m[2] / 2
+    assert low_m == pytest.approx(bottom_m, abs=0.008)
+    assert node.box.center_m[2] + node.box.size_m[2] / 2 == pytest.approx(0.25, abs=0.01)
+    # Asked again, it is the same.
+    assert builder.full().nodes[0].box == node.box

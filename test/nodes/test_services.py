@@ -20,6 +20,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.nodes_bench import LIMIT_S, Bench
 from support.reference_updates import diff
+from support.spaces import seen_room
 from support.surfaces import CUP, HERE, TABLE, slab, view
 
 from deworldsg_ros.cli.app import app
@@ -31,7 +32,7 @@ from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import first_id, read_map
 from deworldsg_ros.nodes.graph_node import GraphNode
-from deworldsg_ros.ros import graph_keeper, graph_services
+from deworldsg_ros.ros import graph_keeper, graph_output, graph_services
 from deworldsg_ros.ros.graph_services import BUSY
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.qos import reliable
@@ -399,3 +400,22 @@ def test_the_room_is_published_while_somebody_listens(robot):
     changed = robot.node.set_parameters([Parameter("output.robot_height_m", value=0.3)])
     assert changed[0].successful
     robot.expect(lambda: len(plans) > count, "the plan of a low robot")
+
+
+def test_rooms_are_found_in_the_background_named_and_saved(robot, client, tmp_path, monkeypatch):
+    monkeypatch.setattr(graph_output, "ROOMS_PERIOD_S", 0.2)
+    builder = robot.node.graph.builder
+    robot.node.graph.submit(lambda: setattr(builder, "space", seen_room()))
+    robot.see()
+    robot.expect(lambda: client.graph.rooms, "the room")
+    (room,) = client.graph.rooms
+    assert 8.0 < room.area_m2 < 12.5
+    answer = robot.ask(client.name_room, room.id, "study")
+    assert answer["text"] == f"room {room.id} is called study"
+    robot.expect(lambda: client.graph.rooms[0].label == "study", "the name")
+    robot.see()
+    robot.ask(client.save)
+    assert read_graph(tmp_path / "a.json").rooms[0].label == "study"
+    assert read_map(Parameters(), tmp_path / "a.map").rooms.names == {room.id: "study"}
+    with pytest.raises(ClientError, match="room 9 is unknown"):
+        robot.ask(client.name_room, 9, "attic")

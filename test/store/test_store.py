@@ -542,3 +542,34 @@ def test_the_commands(tmp_path):
         ["rebuild", tmp_path],
     ):
         assert refusal("store", *words).startswith("error: ")
+
+
+def room_of(room_id: int, label: str, to: int, objects: dict[int, float]) -> wire.RoomState:
+    corners = [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 2.0, 0.0], [0.0, 2.0, 0.0]]
+    doors = [wire.Doorway(to, [0.0, 0.0, 0.0], 0.8)]
+    inside = [wire.RoomObject(*item) for item in objects.items()]
+    return wire.RoomState(room_id, label, [wire.Belief(label, 0.9)], 0, corners, 4.0, doors, inside)
+
+
+def test_rooms_are_those_of_the_newest_message_that_has_some(tmp_path):
+    nodes = [node(1), node(2, "oven")]
+    first = graph(1, 1, nodes)
+    first.rooms = [room_of(1, "kitchen", 2, {1: 0.8, 2: 1.0}), room_of(2, HOSTILE[1], 1, {})]
+    first.storeys_m = [0.0]
+    # An update without rooms leaves them; an object that goes leaves its room.
+    second = graph(2, 2, nodes[:1])
+    store = written(tmp_path, first, *updates_of([first, second]))
+    asked = "MATCH (o:Object)-[i:Inside]->(r:Room) RETURN o.id, r.label, i.probability"
+    assert store.ask(asked).rows == [[1, "kitchen", 0.8]]
+    doors = "MATCH (a:Room)-[d:Doorway]->(b:Room) RETURN a.id, b.label, d.width_m ORDER BY a.id"
+    assert store.ask(doors).rows == [[1, HOSTILE[1], 0.8], [2, "kitchen", 0.8]]
+    (third,) = updates_of([second, graph(3, 3, nodes[:1])])
+    third.rooms, third.storeys_m = [room_of(2, "office", 9, {1: 0.6, 77: 1.0})], [0.0]
+    store = written(tmp_path, third)
+    assert store.ask(asked).rows == [[1, "office", 0.6]]
+    assert store.ask("MATCH (r:Room) RETURN r.id, r.x, r.area_m2").rows == [[2, 1.0, 4.0]]
+    with StoreWriter(tmp_path, anew=True):
+        pass
+    assert store.ask(asked).rows == [[1, "office", 0.6]]
+    # A whole graph without rooms has none.
+    assert written(tmp_path, graph(1, 4, nodes, session="t")).ask(asked).rows == []

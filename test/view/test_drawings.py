@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from rich.console import Console
 from support.view import make_edge, make_graph, make_node, make_room
 
+from deworldsg_ros.cli import outputs
 from deworldsg_ros.scene.arrays import shared_areas
 from deworldsg_ros.scene.camera import pose_from_quaternion
-from deworldsg_ros.view import page, picture, table
+from deworldsg_ros.view import page, picture
 from deworldsg_ros.view.colours import (
     PALETTE,
     class_colours,
@@ -23,6 +24,7 @@ from deworldsg_ros.view.colours import (
 )
 from deworldsg_ros.view.markers import markers, pair_id
 from deworldsg_ros.view.picture import place
+from deworldsg_ros.wire import messages as wire
 
 BACKGROUND_BGR = (247, 250, 251)
 # three.js is 0.6 MB of it.
@@ -126,8 +128,19 @@ def test_marker_ids_are_unique_stable_and_fit_their_message():
 def printed(graph, **options):
     console = Console(width=120, record=True, force_terminal=False)
     with console.capture() as capture:
-        table.print_graph(console, graph, **options)
+        outputs.print_graph(console, graph, **options)
     return capture.get()
+
+
+def test_the_tables_end_with_the_rooms():
+    graph = make_graph([make_node(1, "cup")])
+    assert "rooms" not in printed(graph)
+    corners = [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [4.0, 3.0, 0.0]]
+    graph.rooms = [
+        wire.RoomState(1, "kitchen", [wire.Belief("kitchen", 0.9)], 0, corners, 12.3, [], []),
+        wire.RoomState(2, "office", [wire.Belief("office", 0.55)], 0, corners, 8.0, [], []),
+    ]
+    assert "rooms: kitchen (room 1) of 12 m², office (room 2) of 8 m² (?)" in printed(graph)
 
 
 def test_tables_list_objects_and_relations():

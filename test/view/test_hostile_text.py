@@ -12,7 +12,7 @@ from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.models import inspect_file
 from deworldsg_ros.evaluation.reports import plot_classes, print_protocol
 from deworldsg_ros.evaluation.scoring import Count, ProtocolResult
-from deworldsg_ros.view import page, picture, table
+from deworldsg_ros.view import page, picture
 
 LABELS = [
     "$\\foo$", "$", "$$x^{$", "__THREE__", "__GRAPH__", "__PAGE__", "[/foo]", "[bold]",
@@ -35,7 +35,7 @@ def console() -> tuple[Console, io.StringIO]:
 
 def printed(graph) -> str:
     terminal, output = console()
-    table.print_graph(terminal, graph)
+    outputs.print_graph(terminal, graph)
     return output.getvalue()
 
 

@@ -198,3 +198,21 @@ def test_names_are_text_whatever_they_contain(chromium, tmp_path):
         assert (
             shown.evaluate("document.images.length + (hiddenClasses.size)") == 1
         )  # the hidden one
+
+
+def test_rooms_have_outlines_names_and_their_objects(chromium, tmp_path):
+    graph = make_graph([make_node(1, "cup", (1.0, 1.0, 0.5))])
+    corners = [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [4.0, 3.0, 0.0], [0.0, 3.0, 0.0]]
+    kinds, inside = [wire.Belief("kitchen", 0.6)], [wire.RoomObject(1, 0.9)]
+    graph.rooms = [wire.RoomState(7, "kitchen", kinds, 0, corners, 12.0, [], inside)]
+    with opened_page(chromium, url_of(graph, tmp_path)) as shown:
+        shown.wait_for_timeout(300)
+        labels = shown.locator("#labels .place").all_inner_texts()
+        assert labels == ["kitchen (room 7)?"]  # of 60 %
+        shown.evaluate("choose(1)")
+        until(shown, "document.querySelector('#card dl') !== null", "the card")
+        assert "kitchen (room 7)?, 90 %" in shown.locator("#card").inner_text().replace("\xa0", " ")
+        with_rooms = drawn(pixels(shown))
+        shown.locator("#switches label", has_text="rooms").click()
+        until(shown, "document.querySelectorAll('#labels .place').length === 0", "no names")
+        assert drawn(pixels(shown)) < with_rooms

@@ -215,3 +215,42 @@ def test_a_node_that_changed_often_is_sent_once_and_others_not_at_all() -> None:
     again.set(graph(90, names={2: "bowl"}))
     ask(again, reader)
     assert reader.message() == graph(90, names={2: "bowl"})
+
+
+def room(room_id: int, label: str) -> wire.RoomState:
+    corners = [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [3.0, 2.0, 0.0]]
+    return wire.RoomState(room_id, label, [wire.Belief(label, 0.9)], 0, corners, 3.0, [], [])
+
+
+def test_rooms_reach_every_kind_of_copy() -> None:
+    """Update 2 brings rooms, 3 nothing about them, and 4 others."""
+    rooms = [None, [room(1, "kitchen")], None, [room(1, "kitchen"), room(2, "office")]]
+    updates, known, wholes = [], msgspec.UNSET, []
+    for number, told in enumerate(rooms, 1):
+        known = known if told is None else told
+        storeys = msgspec.UNSET if known is msgspec.UNSET else [0.0]
+        whole = msgspec.structs.replace(graph(number), rooms=known, storeys_m=storeys)
+        wholes.append(wire.decode(wire.encode(whole), wire.SceneGraphMessage))
+        sent = update(number)
+        if told is not None:
+            sent.rooms, sent.storeys_m = told, [0.0]
+        updates.append(wire.decode(wire.encode(sent), wire.SceneGraphUpdateMessage))
+    replica, late, log, reader = GraphReplica(), GraphReplica(), ChangeLog(), GraphReplica()
+    late.reset(wholes[2])
+    for sent, whole in zip(updates, wholes):
+        replica.apply(sent)
+        assert replica.message() == whole
+        log.set(whole)
+        ask(log, reader)
+        assert reader.message() == whole
+    late.apply(updates[3])
+    assert late.message() == wholes[3]
+    for first in range(4):
+        joined = GraphReplica()
+        if first:
+            joined.reset(wholes[first - 1])
+        joined.apply(follow.join(updates[first:]))
+        assert joined.message() == wholes[3]
+    assert log.since("a", 3).rooms == rooms[3]
+    log.set(msgspec.structs.replace(wholes[3], sequence=5))
+    assert log.since("a", 4).rooms is msgspec.UNSET  # not again

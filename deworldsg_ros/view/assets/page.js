@@ -8,7 +8,8 @@ const kept = JSON.parse(byId("graph").textContent);
 const isLive = kept === null;
 
 const nodes = new Map(), edges = new Map(), clouds = new Map(), photos = new Map();
-let head = { colours: {}, tints: {}, verbs: {}, frame_id: "", hidden: {}, why: "waiting for the server" };
+let head = { colours: {}, tints: {}, verbs: {}, frame_id: "", hidden: {}, rooms: [],
+  why: "waiting for the server" };
 let path = [];  // where the camera was
 let eye = null;  // the camera now: centre, axes, fov, aspect
 
@@ -79,6 +80,8 @@ const layers = {
     { ...paint, size: 2, sizeAttenuation: false })),
   arrows: new THREE.Mesh(empty(), new THREE.MeshBasicMaterial(paint)),
   camera: new THREE.LineSegments(empty(), new THREE.LineBasicMaterial(paint)),
+  // Seen through the points of the floor.
+  rooms: new THREE.LineSegments(empty(), new THREE.LineBasicMaterial({ ...paint, depthTest: false })),
 };
 for (const layer of Object.values(layers)) {
   layer.frustumCulled = false;
@@ -361,6 +364,34 @@ function drawCamera() {
   fill(layers.camera, places, colours);
 }
 
+// The outlines of the rooms, a little above the floor, and where their names are.
+const roomPlaces = new Map();
+
+function drawRooms() {
+  const places = [], colours = [], colour = rgb("#2f7fb5");
+  roomPlaces.clear();
+  for (const { id, outline } of hiddenKinds.has("rooms") ? [] : head.rooms) {
+    const middle = new THREE.Vector3();
+    outline.forEach((corner, at) => {
+      const next = outline[(at + 1) % outline.length];
+      places.push(corner[0], corner[1], corner[2] + 0.03, next[0], next[1], next[2] + 0.03);
+      colours.push(...colour, 0.9, ...colour, 0.9);
+      middle.add(new THREE.Vector3(...corner).divideScalar(outline.length));
+    });
+    roomPlaces.set(id, middle);
+  }
+  fill(layers.rooms, places, colours);
+}
+
+const roomName = ({ name, sure }) => `${name}${sure ? "" : "?"}`;
+
+// The room in which an object most probably is, and how probable that is.
+function roomOf(id) {
+  const found = head.rooms.flatMap(room => room.objects.filter(([node]) => node === id)
+    .map(([, share]) => [room, share])).sort((a, b) => b[1] - a[1]);
+  return found.length ? `${roomName(found[0][0])}, ${percent(found[0][1])}` : null;
+}
+
 // Everything that is drawn is between these corners.
 const low = new THREE.Vector3(), high = new THREE.Vector3();
 let reach = 1, floor = null, fitted = 0, isMoved = false;
@@ -462,6 +493,8 @@ function drawLabels() {
     put(name(first), top_(nodes.get(first)), "strong");
     for (const [edge, middle] of middles) put(edge.predicate, middle, "predicate strong");
   }
+  for (const one of head.rooms)
+    if (roomPlaces.has(one.id)) put(roomName(one), roomPlaces.get(one.id), "place");
   for (const node of visibleNodes().sort((a, b) => b.observations - a.observations))
     if (node.id !== first) put(name(node.id), top_(node), node.sure ? "" : "unsure");
   if (first === null)
@@ -489,6 +522,7 @@ function draw(...parts) {
       drawBoxes();
       drawArrows();
       drawPoints();
+      drawRooms();
       fillList();
       showCard(pointed ?? chosen);
       showEmpty();
@@ -539,6 +573,7 @@ function showCard(id) {
     ["if it exists", (node.named ? "" : "perhaps ") + classes.join(", ")],
     ["size", `${node.sizeWords.join(" × ")} cm`],
     ["colour", node.looks],
+    ["in", roomOf(id)],
     ["position", `${node.position.map(value => value.toFixed(2)).join(", ")} m`],
     ["seen in", plural(node.observations, "frame")],
   ]) if (text !== null) facts.append(element("dt", "", term), element("dd", "", text));

@@ -32,6 +32,7 @@ from deworldsg_ros.view.page import (
     cloud_values,
     edge_values,
     path_values,
+    room_values,
     surface_values,
     values_of,
     why,
@@ -358,6 +359,7 @@ class LiveState:
                 "verbs": {predicate: verb_of(predicate) for predicate in self._predicates},
                 "frame_id": scene.frame_id,
                 "hidden": {},
+                "rooms": room_values(self.history.newest.rooms, self._axes),
                 "why": self.why_empty,
             }
         )
