@@ -42,6 +42,7 @@ ENTRIES = {
     for entry in (
         Entry("lifting", "bench.lifting:figures", limit_s=120, takes_s=8),
         Entry("integration", "bench.integration:figures", limit_s=300, takes_s=30),
+        Entry("slam", "bench.slam:figures", limit_s=300, takes_s=90),
         Entry("step", "bench.step:figures", limit_s=240, takes_s=20),
         Entry("fross", "bench.fross:figures", limit_s=240, takes_s=40),
         Entry("merging_search", "bench.merging:search_figures", limit_s=120, takes_s=5),

@@ -8,23 +8,25 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
+import numpy as np
+
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph.edits import GraphEdit, NameRoom
 from deworldsg_ros.graph.extent import NodeBoxes
-from deworldsg_ros.graph.graph import GlobalGraph, nodes_since
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import hidden_node
 from deworldsg_ros.graph.pairs import frame_votes
-from deworldsg_ros.graph.provenance import FrameMemory, SeenSpace
+from deworldsg_ros.graph.provenance import FrameMemory, SeenSpace, Trail, TrailChange
 from deworldsg_ros.graph.publication import Publication
 from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.stage import build_merging
-from deworldsg_ros.poses.drift import Drift
+from deworldsg_ros.poses.drift import Drift, moved
 from deworldsg_ros.relations import beliefs
 from deworldsg_ros.relations.beliefs import EdgeBeliefs
 from deworldsg_ros.relations.paper import ClassPairPrior, candidates
-from deworldsg_ros.scene.arrays import Float64, softmax_weights
-from deworldsg_ros.scene.camera import UpEstimator, check_pose, invert_pose
+from deworldsg_ros.scene.arrays import Float64, Int64, softmax_weights
+from deworldsg_ros.scene.camera import UpEstimator, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
 from deworldsg_ros.scene.limits import RESTART_NS
@@ -32,6 +34,8 @@ from deworldsg_ros.wire import messages as wire
 
 # Parts of the kernels that take about equally long to compile.
 KERNEL_PARTS = ("merging", "drift", "pairs")
+# Nodes that follow a trajectory in one call: about 10 ms.
+MOVED_A_CALL = 32
 
 
 class GraphBuilder:
@@ -48,6 +52,7 @@ class GraphBuilder:
         merging: the association rule.
         frames: from which frames the nodes and edges come.
         space: the space that the camera has seen as free.
+        trail: the poses of the frames.
         rooms: the rooms of that space, as of the last `find_rooms` or `set_rooms`.
         prior: of class pairs.
         refused: what was left out of the newest frame, in words, by reason.
@@ -82,7 +87,10 @@ class GraphBuilder:
             min_name=output.min_name,
             include_surface_points=output.include_surface_points,
         )
-        self.frames, self.space, self.rooms = FrameMemory(), SeenSpace(), RoomMap()
+        self.frames, self.space, self.trail = FrameMemory(), SeenSpace(), Trail()
+        self.rooms = RoomMap()
+        # How keyframes have moved, and the nodes that have still to follow.
+        self._T_new_old, self._due = np.eye(4)[None], list[int]()
         self._newest_ns: int | None = None
         self.refused: dict[str, str] = {}
 
@@ -133,8 +141,15 @@ class GraphBuilder:
                 f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",
             )
         local = candidates(self.graph.admit(local), self._relations)
+        if self._due or self.trail.is_changing:
+            local = self._catch_up(local)
+        T_given = local.T_world_camera
         if self._drift is not None:
             local = self._drift.align(local)
+        if self.trail.note(local.stamp_ns, T_given, local.T_world_camera):
+            self.settle()  # by the old numbers
+            self.graph.nodes.halve_keyframes()
+        self.graph.nodes.keyframe = self.trail.keyframe
         logits = local.relations.logits
         weights = softmax_weights(logits) if logits.size else None
         if self._drift is not None:
@@ -152,6 +167,13 @@ class GraphBuilder:
         self._publication.note_frame(local.stamp_ns, node_ids)
         return node_ids
 
+    def _catch_up(self, local: LocalGraph) -> LocalGraph:
+        """The frame under the present trajectory; the next nodes follow it, too."""
+        if self._due:
+            self._move_some()
+        T_new_old = self.trail.admit(local.stamp_ns, local.T_world_camera)
+        return local if T_new_old is None else moved(local, T_new_old)
+
     def _add_embeddings(self, local: LocalGraph, node_ids: list[int]) -> None:
         try:
             self.graph.add_embeddings(local, node_ids)
@@ -166,6 +188,7 @@ class GraphBuilder:
         Raises:
             RefusedInput: ``invalid_request``, with the reason; nothing is changed then.
         """
+        self.settle()
         if isinstance(request, NameRoom):
             rooms = self.rooms.named(request.room, request.name)
             self.set_rooms(rooms, rooms.states(self.snapshot().nodes))
@@ -197,33 +220,74 @@ class GraphBuilder:
         """Take in neighbour pairs and predictions; see `EdgeBeliefs.add`."""
         self._edges.add(evidence)
 
-    def apply_correction(self, T_correction: Float64, since_ns: int) -> list[int]:
-        """Move the nodes first seen since a stamp, after a loop closure corrected the poses.
+    def apply_trajectory(self, stamps_ns: Int64, T_world_body: Float64) -> int:
+        """Follow a trajectory that SLAM has corrected, see `Trail.follow`; returns as `follow`."""
+        return self.follow(self.trail.follow(stamps_ns, T_world_body))
 
-        Older nodes stay, also those seen again since: see `graph.graph`. Frames to come must
-        have corrected poses. The nodes already contain the drift that was corrected; this part is
-        taken back.
+    def apply_correction(self, T_correction: Float64, since_ns: int) -> int:
+        """Follow one transform of all poses since a stamp; poses to come have to be corrected.
 
         Args:
             T_correction: (4, 4), from the old world frame to the corrected one.
             since_ns: stamp of the first pose that was corrected.
 
         Returns:
-            The ids of the nodes that moved.
+            As `follow`.
 
         Raises:
             RefusedInput: ``invalid_pose`` if it is no rigid transform.
         """
         check_pose(T_correction)
+        return self.follow(self.trail.since(T_correction, since_ns))
+
+    def follow(self, change: TrailChange | None) -> int:
+        """Move what was seen with the poses that it was seen from.
+
+        Objects move, their surfaces point by point, and the views of the room. Nodes that meet then
+        are merged; the older id stays. The first nodes move at once, the nearest first, the others
+        with the next frames and updates.
+
+        Args:
+            change: of `trail`; None = none.
+
+        Returns:
+            The number of nodes that move.
+        """
+        if change is None:
+            return 0
+        self.settle()
         if self._drift is not None:
-            T_correction = T_correction @ invert_pose(self._drift.T_graph_poses)
             self._drift = Drift()
-        node_ids = nodes_since(self.graph, since_ns)
-        for node_id in node_ids:
-            self.graph.move_node(node_id, T_correction)
-        self.merging.moved(self.graph, node_ids, T_correction)
-        self.space.move(T_correction, since_ns)
-        return node_ids
+        self.space.move(change)
+        nodes, self._T_new_old = self.graph.nodes, change.T_new_old
+        slots = nodes.slots
+        counts = np.maximum(nodes.surface_counts[slots, None], 1)
+        used = np.arange(nodes.surface_keyframes.shape[1]) < counts
+        moves = (change.moved[nodes.surface_keyframes[slots]] & used).any(axis=1)
+        slots = slots[moves]
+        # The nearest first: the next frames meet no node that has still to be moved.
+        apart = np.linalg.norm(nodes.means[slots] - self.trail.camera_world, axis=1)
+        self._due = nodes.ids[slots[apart.argsort(kind="stable")]].tolist()
+        count = len(self._due)
+        self._move_some()
+        return count
+
+    def settle(self) -> None:
+        """Move all nodes that have still to follow a trajectory."""
+        while self._due:
+            self._move_some()
+
+    def _move_some(self) -> None:
+        """Move the next nodes."""
+        part, self._due = self._due[:MOVED_A_CALL], self._due[MOVED_A_CALL:]
+        node_ids = [node_id for node_id in part if node_id in self.graph]
+        if node_ids:
+            # Points of frames since then stay.
+            known = len(self._T_new_old)
+            T = np.broadcast_to(np.eye(4), (max(known, self.trail.keyframe + 1), 4, 4)).copy()
+            T[:known] = self._T_new_old
+            slots = self.graph.nodes.slots_of(node_ids)
+            self._boxes.move(node_ids, self.merging.move(self.graph, slots, T, self._due))
 
     def update(self) -> wire.SceneGraphUpdateMessage | None:
         """The changes since the last call; None if there are none.
@@ -232,13 +296,15 @@ class GraphBuilder:
         that changed, some are left for the next calls: see `waiting`. After a large map was read,
         the first calls return None and prepare it in parts: the first update has all of it.
         """
+        if self._due:
+            self._move_some()
         self._publication.set_up(self.up.up_world(exact=False))
         return self._publication.update()
 
     @property
     def waiting(self) -> int:
-        """Number of surfaces and pairs that the next updates take in; `full` leaves none."""
-        return self._edges.waiting + self._publication.waiting
+        """Number of nodes, surfaces and pairs that the next updates take in; `full` leaves none."""
+        return len(self._due) + self._edges.waiting + self._publication.waiting
 
     def snapshot(self) -> wire.SceneGraphMessage:
         """The graph after the last `update`."""
@@ -246,6 +312,7 @@ class GraphBuilder:
 
     def full(self) -> wire.SceneGraphMessage:
         """The present graph with surface points and hidden nodes; `update` is unaffected."""
+        self.settle()
         self._publication.set_up(self.up.up_world())
         message = self._publication.full()
         message.hidden = self._hidden_nodes()

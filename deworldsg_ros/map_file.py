@@ -56,12 +56,14 @@ def write_map(builder: GraphBuilder, path: Path) -> None:
 
 def copy_state(builder: GraphBuilder) -> Arrays:
     """The content of a map, by name; the builder can go on while it is written."""
+    builder.settle()
     prior = np.frombuffer(msgspec.json.encode(builder.prior.to_state()), np.uint8)
     memory = {_MERGING + name: np.array(v) for name, v in builder.merging.memory().items()}
     arrays = graph_files.to_arrays(builder.graph.state())
     seen = np.frombuffer(msgspec.json.encode(builder.frames.all(builder.graph)), np.uint8)
     up = np.array(builder.up.state())
     more: Arrays = {"prior": prior, "up": up, "seen_frames": seen, **builder.space.arrays()}
+    more.update(builder.trail.arrays())
     more.update(builder.rooms.arrays())
     return {**arrays, **memory, **more}
 
@@ -220,6 +222,7 @@ def _read(config: Config, path: Path) -> GraphBuilder:
     if "up" in arrays:  # not in maps of older releases
         builder.up.restore(arrays["up"])
     builder.space.restore(arrays)
+    builder.trail.restore(arrays)
     builder.rooms = RoomMap.restored(arrays)
     if "seen_frames" in arrays:  # nor this
         builder.frames = FrameMemory(_seen_frames(arrays, graph.vocabulary))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.merging import VOCABULARY, local_graph
+from support.merging import VOCABULARY, local_graph, move_node
 
 from deworldsg_ros.client import ClientError, SceneGraph
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig
@@ -60,7 +60,7 @@ def test_colours_are_means_over_the_pixels_of_all_frames(association, tmp_path):
     assert colour == {a: seen[a], b: BLUE}
     # A copy, a node that moved, and one that was merged have the colours of all their frames.
     copied = copy_node(graph, a)
-    graph.move_node(copied, np.eye(4))
+    move_node(graph, copied, np.eye(4))
     graph.take_over(b, copied)
     assert graph.nodes.colours[graph.nodes.slot(b), 3] == 500
     graph.merge_nodes(a, b)

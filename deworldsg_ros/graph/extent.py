@@ -334,6 +334,13 @@ class NodeBoxes:
         nodes, shown = self._nodes, None if self._shown is None else self._shown(slots)
         return extents_of(nodes.surface_points_world, nodes.surface_counts, slots, up, shown)
 
+    def move(self, node_ids: Sequence[int], T_new_old: Float64) -> None:
+        """Move the ends of boxes with their nodes, each by a rigid transform (n, 4, 4)."""
+        for node_id, T in zip(node_ids, T_new_old):
+            if (ends := self._ends.get(node_id)) is not None:
+                ends.center = T[:3, :3] @ ends.center + T[:3, 3]
+                ends.axes = ends.axes @ T[:3, :3].T
+
     def followed(self, node_id: int, box: wire.GravityBox) -> wire.GravityBox:
         """The box of a node, down to what it rests on, with the sides that may go on."""
         known, sides = self._ends.get(node_id), UNSET

@@ -24,11 +24,11 @@ from deworldsg_ros.graph.pairs import (
     PairVotes,
     VotesByPair,
 )
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary, derived
 from deworldsg_ros.scene.limits import MAX_NAMES
-from deworldsg_ros.scene.surface import NO_POINTS
+from deworldsg_ros.scene.surface import NO_KEYFRAMES, NO_POINTS
 
 # --- The global 3D scene graph: Gaussian nodes, sparse directed edges, stable ids.
 
@@ -42,6 +42,7 @@ class GraphState:
         surface_point_capacity, remembered_frames, even_gaussians: its settings; see `GlobalGraph`.
         nodes: arrays of n rows, by ascending ids, by their names in `NodeTable`.
         surface_points: (m, 3) float32, metres, those of one node after those of another.
+        surface_keyframes: (m,) uint16, of each of these points.
         surface_counts: (n,) int64, number of points of each node.
         pairs: evidence of edges, and votes.
         ids: the id memory.
@@ -53,6 +54,7 @@ class GraphState:
     frame_id: str
     nodes: Mapping[str, NDArray[Any]]
     surface_points: Float32
+    surface_keyframes: UInt16
     surface_counts: Int64
     pairs: PairArrays
     ids: IdState
@@ -117,7 +119,8 @@ class GlobalGraph:
             state.remembered_frames,
             state.even_gaussians,
         )
-        graph.nodes.restore(state.nodes, state.surface_points, state.surface_counts)
+        surfaces = state.surface_points, state.surface_keyframes, state.surface_counts
+        graph.nodes.restore(state.nodes, *surfaces)
         graph.pairs.restore(state.pairs)
         graph._ids = NodeIds(graph.nodes, state.remembered_frames, state.ids)
         graph.edits = EditLog(state.edits)
@@ -133,6 +136,7 @@ class GlobalGraph:
             frame_id=self.frame_id,
             nodes={name: getattr(nodes, name)[slots] for name in SAVED},
             surface_points=np.concatenate([NO_POINTS, *map(nodes.surface, slots.tolist())]),
+            surface_keyframes=np.concatenate([NO_KEYFRAMES, *map(nodes.keyframes, slots.tolist())]),
             surface_counts=nodes.surface_counts[slots],
             pairs=self.pairs.arrays(),
             ids=self._ids.state(),
@@ -296,13 +300,14 @@ class GlobalGraph:
         self._changed(slots[differs])
         return list(itertools.compress(node_ids, (confirmed & ~known).tolist()))
 
-    def move_node(self, node_id: int, T_correction: Float64) -> None:
-        """Apply a pose correction (4, 4), from the old world frame to the new, to a live node."""
-        slot = self.nodes.slot(node_id)
-        self.nodes.move(slot, T_correction)
+    def move_nodes(self, slots: Int64, T_new_old: Float64) -> Float64:
+        """Move nodes as the keyframes that saw them have moved; see `NodeTable.move`."""
+        main = self.nodes.move(slots, T_new_old)
         if self.embeddings.views:
-            self.embeddings.turn(node_id, T_correction[:3, :3])
-        self._changed([slot])
+            for node_id, T in zip(self.nodes.ids[slots].tolist(), main):
+                self.embeddings.turn(node_id, T[:3, :3])
+        self._changed(slots)
+        return main
 
     @property
     def next_id(self) -> int:
@@ -538,7 +543,7 @@ def copy_node(
     graph: GlobalGraph,
     node_id: int,
     without: Collection[int] = (),
-    points_world: Float32 | None = None,
+    part: Bool | None = None,
 ) -> int:
     """Add a copy of a live node, with its edges and votes; returns its id.
 
@@ -546,36 +551,24 @@ def copy_node(
         graph: changed.
         node_id: of the node.
         without: nodes to which the copy has no edges.
-        points_world: (k, 3) float32, the part of the node's surface points that the copy gets, with
-            the Gaussian of these points; None = everything.
+        part: (k,) which of the node's surface points the copy gets, with the Gaussian of these
+            points; None = everything.
     """
     nodes, slot = graph.nodes, graph.nodes.slot(node_id)
     mean, covariance = nodes.means[slot].copy(), nodes.covariances[slot].copy()
     surface, weight = nodes.surface(slot).copy(), float(nodes.weights[slot])
-    if points_world is not None:
-        mean, covariance = even_moments(points_world)
-        surface, weight = points_world, weight * len(points_world) / len(surface)
+    keyframes = nodes.keyframes(slot).copy()
+    if part is not None:
+        surface, keyframes = surface[part], keyframes[part]
+        mean, covariance = even_moments(surface)
+        weight = weight * len(surface) / len(part)
     classes, first_ns = nodes.class_probabilities[slot].copy(), int(nodes.first_seen_ns[slot])
     confirmed = bool(nodes.confirmed[slot])
     new_id = graph.add_node(mean, covariance, classes, first_ns, surface, weight, confirmed)
     new = nodes.slot(new_id)
+    nodes.set_surface(new, surface, keyframes)
     for name in ("class_probabilities", "observations", "existence", "last_seen_ns", "colours"):
         getattr(nodes, name)[new] = getattr(nodes, name)[slot]
     graph.copy_relations(node_id, new_id, without)
     graph.embeddings.copy(node_id, new_id)
     return new_id
-
-
-# --- Pose corrections: which nodes move with corrected poses.
-#
-# When a SLAM system closes a loop, it corrects the poses of a part of the trajectory. Nodes first
-# seen in that part have the error of its poses and are moved by the correction. A node that was
-# seen before and again in that part averages both. Its earlier observations had correct poses, so
-# it stays.
-
-
-def nodes_since(graph: GlobalGraph, since_ns: int) -> list[int]:
-    """Ids of the nodes first seen at a stamp or later, ascending."""
-    nodes = graph.nodes
-    slots = nodes.slots
-    return sorted(nodes.ids[slots[nodes.first_seen_ns[slots] >= since_ns]].tolist())

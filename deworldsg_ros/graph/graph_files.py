@@ -19,7 +19,7 @@ from deworldsg_ros.graph.graph import GlobalGraph, GraphState
 from deworldsg_ros.graph.nodes import MAX_ID, SAVED, IdState
 from deworldsg_ros.graph.pairs import PairArrays
 from deworldsg_ros.scene import limits
-from deworldsg_ros.scene.arrays import Int64
+from deworldsg_ros.scene.arrays import Int64, UInt16
 from deworldsg_ros.scene.checks import (
     acyclic,
     checked,
@@ -304,6 +304,7 @@ def to_arrays(state: GraphState) -> Arrays:
         "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
         **state.nodes,
         "surface_points": state.surface_points,
+        "surface_keyframes": state.surface_keyframes,
         "surface_point_counts": state.surface_counts,
         **vars(state.pairs),
         **_id_arrays(state.ids),
@@ -357,6 +358,7 @@ def _state(arrays: Arrays) -> GraphState:
         frame_id=header.frame_id,
         nodes={name: _column(arrays, name) for name in SAVED},
         surface_points=arrays["surface_points"],
+        surface_keyframes=_keyframes(arrays),
         surface_counts=arrays["surface_point_counts"],
         pairs=_pairs(arrays, len(header.predicates)),
         ids=_ids(arrays, header.next_id),
@@ -391,6 +393,14 @@ def _column(arrays: Arrays, name: str) -> NDArray[Any]:
         if name == "colours":
             return np.zeros((count, 4))
     return arrays[name]
+
+
+def _keyframes(arrays: Arrays) -> UInt16:
+    """The keyframe of each surface point; not known (0) in files of older releases."""
+    count = len(arrays["surface_points"])
+    if "surface_keyframes" not in arrays:
+        return np.zeros(count, np.uint16)
+    return checked(arrays, "surface_keyframes", np.uint16, count)
 
 
 def _pairs(arrays: Arrays, width: int) -> PairArrays:

@@ -13,14 +13,13 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from deworldsg_ros.base.kernels import kernel
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.gaussian import (
     eigenvalue_bound,
     eigenvalue_bounds,
     log_determinant,
     log_determinants,
-    transform,
 )
 from deworldsg_ros.scene.surface import add_flat, add_points, drop_points
 
@@ -160,6 +159,10 @@ class NodeIds:
 # Slots for which a table has room at first, and surface points of each.
 FIRST_SLOTS = 64
 FIRST_POINTS = 64
+# Positions of a mean that differ by less are one: the noise of a depth camera, and cells of 3 cm.
+ALIKE_M = 0.005
+# Fewer points have no covariance. It gets a ridge: they may lie on a plane.
+LEAST_POINTS, RIDGE_M2 = 4, 1e-6
 # A covariance with a pivot below this fraction of its trace is singular up to rounding.
 SINGULAR = 1e-13
 # Saved arrays of the nodes, beside their surface points; the other arrays follow from these.
@@ -190,6 +193,7 @@ class Observations:
         counts: (n,) int64, number of frames in each row.
         surfaces: n arrays (k, 3) float32 of surface points, metres.
         first_seen_ns, last_seen_ns: time span of all rows.
+        keyframes: (m,) uint16, of the m points of all surfaces; None = the present one.
     """
 
     means_world: Float64
@@ -200,6 +204,7 @@ class Observations:
     surfaces: Sequence[Float32]
     first_seen_ns: int
     last_seen_ns: int
+    keyframes: UInt16 | None = None
 
 
 class _Gaussians(NamedTuple):
@@ -238,10 +243,13 @@ class NodeTable:
         existence: (n,) float64, probability that it is an object; -1 = not estimated.
         surface_points_world: (n, K, 3) float32, metres: a sample of each node's surface points, of
         surface_counts: (n,) int64 points; see `surface`. K grows up to the capacity.
+        surface_keyframes: (n, K) uint16, from which keyframe each point was seen; 0 = not known.
+            Without points, the first is the keyframe that saw the node.
         surface_revisions: (n,) int64, number of changes of the surface so far.
         colours: (n, 4) float64, sums over the frames of w L, w a, w b (CIELAB), and w, the number
             of pixels; 0 = not known.
         slot_of: the slot of each id; read only.
+        keyframe: number of the present keyframe (`provenance.Trail`), that of points to come.
     """
 
     ids: Int64
@@ -257,6 +265,7 @@ class NodeTable:
     first_seen_ns: Int64
     last_seen_ns: Int64
     surface_points_world: Float32
+    surface_keyframes: UInt16
     surface_counts: Int64
     surface_revisions: Int64
     colours: Float64
@@ -277,6 +286,7 @@ class NodeTable:
             "first_seen_ns": (np.int64, ()),
             "last_seen_ns": (np.int64, ()),
             "surface_points_world": (np.float32, (points, 3)),
+            "surface_keyframes": (np.uint16, (points,)),
             "surface_counts": (np.int64, ()),
             "surface_revisions": (np.int64, ()),
             "colours": (np.float64, (4,)),
@@ -286,6 +296,7 @@ class NodeTable:
             name: np.zeros((FIRST_SLOTS, *shape), dtype) for name, (dtype, shape) in layout.items()
         }
         self.slot_of: dict[int, int] = {}
+        self.keyframe = 0
         self._surface_point_capacity = surface_point_capacity
         self._free: list[int] = []
         self._show(0)
@@ -380,7 +391,7 @@ class NodeTable:
                 f"covariance {seen.covariances_world[refused].tolist()}, fused into node "
                 f"{self.ids[slots[refused]]}, gives one that is not positive definite"
             )
-        self._add_surfaces(slots, seen.surfaces)
+        self._add_surfaces(slots, seen.surfaces, seen.keyframes)
         self.first_seen_ns[slots] = np.minimum(self.first_seen_ns[slots], seen.first_seen_ns)
         self.last_seen_ns[slots] = np.maximum(self.last_seen_ns[slots], seen.last_seen_ns)
 
@@ -400,29 +411,100 @@ class NodeTable:
         classes = counts @ self.class_probabilities[[slot, other]] / counts.sum()
         gaussian = self.means[other].copy(), self.covariances[other].copy()
         self.put(slot, *gaussian, classes, float(self.weights[other]), int(counts.sum()))
-        self.set_surface(slot, self.surface(other))
+        self.set_surface(slot, self.surface(other), self.keyframes(other))
         self.colours[slot] += self.colours[other]
         self.confirmed[slot], self.existence[slot] = self.confirmed[other], self.existence[other]
         self.last_seen_ns[slot] = self.last_seen_ns[other]
 
-    def move(self, slot: int, T: Float64) -> None:
-        """Apply a rigid transform (4, 4) to the Gaussian and the surface points of a node."""
-        gaussian = transform(self.means[slot], self.covariances[slot], T)
-        classes, weight = self.class_probabilities[slot].copy(), float(self.weights[slot])
-        self.put(slot, *gaussian, classes, weight, int(self.observations[slot]))
-        points = self.surface(slot).astype(np.float64) @ T[:3, :3].T
-        points += T[:3, 3]
-        self.set_surface(slot, points.astype(np.float32))
+    def move(self, slots: Int64, T_new_old: Float64) -> Float64:
+        """Move nodes, their surfaces point by point, as the keyframes that saw them have moved.
+
+        A Gaussian moves rigidly if all points of its node do, by less than `ALIKE_M` otherwise. If
+        not, it gets the covariance of the points.
+
+        Args:
+            slots: (n,) of different nodes.
+            T_new_old: (k, 4, 4) rigid transforms by the number of the keyframe.
+
+        Returns:
+            (n, 4, 4), the transform of the keyframe that saw most of each node.
+        """
+        counts = self.surface_counts[slots]
+        used = np.arange(self.surface_points_world.shape[1]) < counts[:, None]
+        points, keyframes = self.surface_points_world[slots], self.surface_keyframes[slots]
+        points, keyframes = points[used], keyframes[used]
+        starts = np.append(0, np.cumsum(counts))
+        old, T = points.astype(np.float64), T_new_old[keyframes]
+        new = (T[:, :3, :3] @ old[:, :, None])[:, :, 0] + T[:, :3, 3]
+        main = self._move_gaussians(slots, T_new_old, keyframes, starts, (old, new))
+        self.surface_counts[slots] = 0
+        self.surface_revisions[slots] += 1
+        samples = self.surface_points_world, self.surface_keyframes, self.surface_counts
+        add_flat(samples, slots, new.astype(np.float32), keyframes, starts)
+        return main
+
+    def _move_gaussians(
+        self,
+        slots: Int64,
+        T_new_old: Float64,
+        keyframes: UInt16,
+        starts: Int64,
+        points: tuple[Float64, Float64],
+    ) -> Float64:
+        """Move the Gaussians of nodes as their points (m, 3), before and after; see `move`."""
+        main = np.broadcast_to(np.eye(4), (len(slots), 4, 4)).copy()
+        counts = np.diff(starts)
+        # The keyframes of each node, and the one that saw most of its points.
+        rows = np.append(np.repeat(np.arange(len(slots)), counts), np.flatnonzero(counts == 0))
+        of_empty = self.surface_keyframes[slots[counts == 0], :1].ravel()
+        keyframes = np.append(keyframes, of_empty)
+        kinds, sizes = np.unique(rows << 16 | keyframes, return_counts=True)
+        rows, T = kinds >> 16, T_new_old[kinds & 0xFFFF]
+        order = np.lexsort((sizes, rows))
+        last = np.flatnonzero(np.diff(rows[order], append=-1))
+        main[rows[order][last]] = T[order][last]
+        means, covariances = self.means[slots], self.covariances[slots]
+        there = (T[:, :3, :3] @ means[rows, :, None])[:, :, 0] + T[:, :3, 3]
+        moved = (main[:, :3, :3] @ means[:, :, None])[:, :, 0] + main[:, :3, 3]
+        covariances = main[:, :3, :3] @ covariances @ main[:, :3, :3].swapaxes(1, 2)
+        apart = np.abs(there - moved[rows]).max(axis=1) > ALIKE_M
+        mixed = np.zeros(len(slots), np.bool_)
+        mixed[rows[apart]] = True
+        mixed &= counts > LEAST_POINTS
+        for index in np.flatnonzero(mixed).tolist():
+            part = slice(starts[index], starts[index + 1])
+            before, after = (values[part].mean(axis=0) for values in points)
+            moved[index] = after + main[index, :3, :3] @ (means[index] - before)
+            spread = points[1][part] - after
+            covariances[index] = spread.T @ spread / (counts[index] - 1) + RIDGE_M2 * np.eye(3)
+        covariances = (covariances + covariances.swapaxes(1, 2)) / 2
+        self.means[slots], self.covariances[slots] = moved, covariances
+        self.log_determinants[slots] = log_determinants(covariances)
+        self.eigenvalue_bounds[slots] = eigenvalue_bounds(covariances)
+        return main
 
     def surface(self, slot: int) -> Float32:
         """The surface points (k, 3) of a node, metres; a view."""
         return self.surface_points_world[slot, : self.surface_counts[slot]]
 
-    def set_surface(self, slot: int, points_world: Float32) -> None:
-        """Replace the surface points of a node by a sample of these (k, 3)."""
+    def keyframes(self, slot: int) -> UInt16:
+        """The keyframe (k,) of each surface point of a node; a view."""
+        return self.surface_keyframes[slot, : self.surface_counts[slot]]
+
+    def halve_keyframes(self) -> None:
+        """Number the keyframes anew, two as one; see `provenance.Trail.note`."""
+        numbers = self.surface_keyframes
+        numbers[:] = (numbers >> 1) + (numbers & 1)
+
+    def set_surface(
+        self, slot: int, points_world: Float32, keyframes: UInt16 | None = None
+    ) -> None:
+        """Replace the surface points of a node by a sample of these (k, 3), with keyframes (k,)."""
         self.surface_counts[slot] = 0
         self.surface_revisions[slot] += 1
-        self._add_surfaces(np.array([slot]), [points_world])
+        self._add_surfaces(np.array([slot]), [points_world], keyframes)
+        if not len(points_world):  # then the first place is that of the node
+            self.surface_keyframes[slot, :1] = self.keyframe
 
     def drop_points(self, slots: Int64, dropped: Bool) -> Int64:
         """Remove some of the surface points of n nodes, (n, K); but never all points of a node.
@@ -430,12 +512,19 @@ class NodeTable:
         Returns:
             The slots of those of which some were to be removed.
         """
-        drop_points(self.surface_points_world, self.surface_counts, slots, dropped)
+        surfaces = self.surface_points_world, self.surface_keyframes, self.surface_counts
+        drop_points(*surfaces, slots, dropped)
         changed = slots[dropped.any(axis=1)]
         self.surface_revisions[changed] += 1
         return changed
 
-    def restore(self, saved: Mapping[str, NDArray[Any]], points: Float32, counts: Int64) -> None:
+    def restore(
+        self,
+        saved: Mapping[str, NDArray[Any]],
+        points: Float32,
+        keyframes: UInt16,
+        counts: Int64,
+    ) -> None:
         """Fill an empty table with `SAVED` arrays, and some of the points for each node."""
         ids = saved["ids"].tolist()
         self._make_slots(len(ids))
@@ -445,7 +534,10 @@ class NodeTable:
         self.log_determinants[:] = log_determinants(self.covariances)
         self.eigenvalue_bounds[:] = eigenvalue_bounds(self.covariances)
         self._make_point_room(int(counts.max(initial=0)))
-        add_flat(self.surface_points_world, self.surface_counts, points, counts)
+        starts = np.append(0, np.cumsum(counts))
+        samples = self.surface_points_world, self.surface_keyframes, self.surface_counts
+        if self.surface_points_world.size:
+            add_flat(samples, np.arange(len(counts)), points, keyframes, starts)
 
     def _make_slots(self, used: int) -> None:
         """Use this many slots; the new ones are zeros."""
@@ -474,19 +566,25 @@ class NodeTable:
 
     def _make_point_room(self, count: int) -> None:
         """Make room for this many surface points of a node, or for as many as one may have."""
-        known, used = self._storage["surface_points_world"], len(self.ids)
-        if known.shape[1] < min(count, self._surface_point_capacity):
-            larger = _widened(known, count, self._surface_point_capacity)
-            larger[:used, : known.shape[1]] = known[:used]
-            self._storage["surface_points_world"] = larger
+        used, width = len(self.ids), self.surface_points_world.shape[1]
+        if width < min(count, self._surface_point_capacity):
+            for name in ("surface_points_world", "surface_keyframes"):
+                known = self._storage[name]
+                larger = _widened(known, count, self._surface_point_capacity)
+                larger[:used, :width] = known[:used]
+                self._storage[name] = larger
             self._show(used)
 
-    def _add_surfaces(self, slots: Int64, point_sets: Sequence[Float32]) -> None:
+    def _add_surfaces(
+        self, slots: Int64, point_sets: Sequence[Float32], keyframes: UInt16 | None
+    ) -> None:
         if self.surface_points_world.shape[1] < self._surface_point_capacity:
             counts = self.surface_counts[slots].tolist()
             self._make_point_room(max(map(operator.add, counts, map(len, point_sets)), default=0))
-        surfaces = self.surface_points_world, self.surface_counts
-        self.surface_revisions[slots] += add_points(*surfaces, slots, point_sets)
+        if keyframes is None:
+            keyframes = np.full(sum(map(len, point_sets)), self.keyframe, np.uint16)
+        surfaces = self.surface_points_world, self.surface_keyframes, self.surface_counts
+        self.surface_revisions[slots] += add_points(*surfaces, slots, point_sets, keyframes)
 
     def _observed(self, slot: int) -> Observations:
         """Everything that was observed of a node, as one observation."""
@@ -500,15 +598,16 @@ class NodeTable:
             [self.surface(slot)],
             int(self.first_seen_ns[slot]),
             int(self.last_seen_ns[slot]),
+            self.keyframes(slot).copy(),
         )
 
 
-def _widened(known: Float32, count: int, most: int) -> Float32:
+def _widened(known: NDArray[Any], count: int, most: int) -> NDArray[Any]:
     """Zeros for slots of at least this many points, or of `most`; unwritten, without memory."""
     width = known.shape[1]
     while width < count:
         width *= 2
-    return np.zeros((len(known), min(width, most), 3), np.float32)
+    return np.zeros((len(known), min(width, most), *known.shape[2:]), known.dtype)
 
 
 @kernel

@@ -409,11 +409,11 @@ class SurfaceEditor(Editor):
                 f"{MIN_PART_POINTS} there"
             )
         label = graph.edits.labels.get(old_id, "")
-        new_ids = [copy_node(graph, old_id, points_world=part) for part in parts]
+        new_ids = [copy_node(graph, old_id, part=part) for part in parts]
         from scipy.spatial import cKDTree  # slow to import, and only for edits
 
-        tree = cKDTree(np.concatenate(parts))
-        sides = np.repeat([0, 1], [len(part) for part in parts])
+        tree = cKDTree(np.concatenate([points[part] for part in parts]))
+        sides = np.repeat([0, 1], [np.count_nonzero(part) for part in parts])
 
         def on_side(side: int) -> Belongs:
             return lambda centres: sides[tree.query(centres)[1]] == side
@@ -498,8 +498,8 @@ def _names(node_ids: Sequence[int]) -> str:
     return " and ".join(map(str, node_ids))
 
 
-def _parts(points: Float32, near_m: list[Any] | None) -> list[Float32]:
-    """The points (k, 3) nearer to either of two places; without places, the two halves.
+def _parts(points: Float32, near_m: list[Any] | None) -> list[Bool]:
+    """Which points (k, 3) are nearer to either of two places; without places, the two halves.
 
     The larger part is the first one. Parts of fewer than MIN_PART_POINTS are left out.
     """
@@ -509,8 +509,8 @@ def _parts(points: Float32, near_m: list[Any] | None) -> list[Float32]:
     from scipy.spatial import cKDTree  # slow to import, and only for edits
 
     sides = cKDTree(places).query(points)[1]
-    parts = sorted((points[sides == side] for side in (0, 1)), key=len, reverse=True)
-    return [part for part in parts if len(part) >= MIN_PART_POINTS]
+    parts = sorted((sides == side for side in (0, 1)), key=np.count_nonzero, reverse=True)
+    return [part for part in parts if np.count_nonzero(part) >= MIN_PART_POINTS]
 
 
 def _ends(points: Float32) -> Any:

@@ -204,6 +204,23 @@ class LifeCycle:
             reasons[node_id] = "missed by the detector" if is_missed else "seen too little"
         return {**reasons, **dict.fromkeys(edits.deleted, DELETED)}
 
+    def bring_back(self, graph: GlobalGraph, slots: Int64) -> Int64:
+        """Take lost nodes of n slots back: they were lost under poses that were wrong.
+
+        Returns:
+            The slots that have a record.
+        """
+        records, nodes = self._records, graph.nodes
+        for node_id, slot in zip(nodes.ids[slots].tolist(), slots.tolist()):
+            if node_id in self._lost:
+                self._lost.remove(node_id)
+                records.rows["node_id"][slot] = node_id  # the slot is the node's: the rest stays
+                records.rows["through_frames"][slot] = 0
+                records.map.add([slot], records.map.cells_of([nodes.surface(slot)]))
+                records.place(graph, [slot])
+                self.publish_again(graph, [node_id])
+        return slots[[records.has(slot) for slot in slots.tolist()]]
+
     def publish_again(self, graph: GlobalGraph, node_ids: list[int]) -> None:
         """Publish nodes that were hidden, if they are likely to be objects; hide the others."""
         existence = self._records.existence(graph.nodes.slots_of(node_ids))

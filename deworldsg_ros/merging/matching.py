@@ -168,6 +168,31 @@ def match(
     return Matches(slots, on_nodes, scores, touching, one_to_one(scores))
 
 
+def match_nodes(
+    nodes: NodeTable,
+    slots: Int64,
+    overlaps: tuple[Int64, Float64, Float64],
+    overlap_threshold: float,
+    cell_m: float,
+) -> Float64:
+    """Scores (n, k) of matches of n nodes with the k that their surfaces meet; 0 = no match.
+
+    Args:
+        nodes: of the graph.
+        slots: (n,) of the nodes.
+        overlaps: `VoxelMap.overlaps` of their surfaces.
+        overlap_threshold: as `match`.
+        cell_m: as `match`.
+    """
+    others, on_nodes, covered = overlaps
+    columns = nodes.means, nodes.covariances, nodes.class_probabilities
+    items = nodes.means[slots], nodes.covariances[slots], nodes.class_probabilities[slots]
+    scores: Float64 = _match_scores(
+        items, columns, others, on_nodes, covered, overlap_threshold, cell_m**2 / 12
+    )[0]
+    return np.where(others == slots[:, None], 0.0, scores)
+
+
 def one_to_one(scores: Float64) -> list[int]:
     """One-to-one assignment with the greatest total score: column of each row, -1 = none."""
     columns: list[int] = assign(scores).tolist()
@@ -425,7 +450,11 @@ class JointEvidence:
 
     def are_two(self, a: int, b: int) -> bool:
         """Whether viewpoints enough have shown the nodes of two slots as two objects."""
-        return self._balances[min(a, b)].get(max(a, b), 0) <= -TWO_OBJECTS
+        return self.balance(a, b) <= -TWO_OBJECTS
+
+    def balance(self, a: int, b: int) -> int:
+        """Evidence that the nodes of two slots are one object minus evidence that they are two."""
+        return self._balances[min(a, b)].get(max(a, b), 0)
 
     def next_merge(self) -> Pair | None:
         """The next pair that is one object; the caller has to merge it. None = no more."""

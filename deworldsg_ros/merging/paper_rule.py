@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -227,8 +228,16 @@ class PaperMerging:
     def restore(self, graph: GlobalGraph, memory: Arrays) -> None:
         """Does nothing: the rule has no state besides the graph."""
 
-    def moved(self, graph: GlobalGraph, node_ids: list[int], T_correction: Float64) -> None:
-        """Does nothing: the rule has no state besides the graph."""
+    def move(
+        self, graph: GlobalGraph, slots: Int64, T_new_old: Float64, due: Collection[int]
+    ) -> Float64:
+        """See `Merging.move`; nodes merge by Eq. 6."""
+        main = graph.move_nodes(slots, T_new_old)
+        if not due:  # the search compares all nodes
+            for node_id in sorted(graph.nodes.slot_of):
+                if node_id in graph:
+                    self._merge_repeatedly(graph, node_id)
+        return main
 
     def _assign(self, graph: GlobalGraph, local: LocalGraph, row: int) -> int:
         """Fuse an object into its node, or create a node; returns the node's id."""

@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.graph.graph import GlobalGraph
+from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging import beliefs, surface_map
 from deworldsg_ros.merging.beliefs import LABELS
 from deworldsg_ros.merging.cell_kernels import SCORES, CellSets
 from deworldsg_ros.merging.matching import JointEvidence
 from deworldsg_ros.merging.surface_map import CELLS_PER_OWNER, VoxelMap
 from deworldsg_ros.merging.views import VISIBILITIES, NodeGrid
-from deworldsg_ros.scene.arrays import Bool, Float64, Int8, Int64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt16, UInt64
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.checks import (
     MAX_SUM_ERROR,
@@ -394,25 +395,81 @@ class NodeRecords:
             self.rows = np.concatenate((self.rows, np.zeros_like(self.rows)))
 
 
-def apply_correction(
-    records: NodeRecords, graph: GlobalGraph, node_ids: list[int], T_correction: Float64
-) -> None:
-    """Move the cells of nodes that a pose-graph correction (4, 4) has moved in the graph.
+# A cell moves with a surface point in its cube of this size. Odd factors hash node and cube.
+NEAR_M = 0.12
+_HASH_FACTORS = np.array(
+    [0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB, 0xD6E8FEB86659FD93], np.uint64
+)
 
-    Their scores start again at 0: rotated cells do not lie on cells.
+
+def move_nodes(
+    tables: Sequence[NodeRecords], graph: GlobalGraph, slots: Int64, T_new_old: Float64
+) -> Float64:
+    """Move nodes of the graph, and their cells and viewpoints, as keyframes have moved.
+
+    A cell moves with a surface point near it. Moved cells do not lie on cells: each gives its
+    scores to the one that contains its centre.
+
+    Args:
+        tables: records; a node is in one of them, or in none.
+        graph: changed.
+        slots: (n,) of the nodes.
+        T_new_old: (k, 4, 4) by the number of the keyframe; see `NodeTable.move`.
+
+    Returns:
+        (n, 4, 4), how most of each node has moved.
     """
-    for node_id in node_ids:
-        slot = graph.nodes.slot(node_id)
-        # A lost node has no cells.
-        if not records.has(slot) or records.node(slot) != node_id:
-            continue
-        centres = records.map.centres(slot).astype(np.float64)
-        centres = centres @ T_correction[:3, :3].T + T_correction[:3, 3]
-        points = graph.nodes.surface(slot)
-        cells = records.map.cells_of([np.concatenate((centres.astype(np.float32), points))])
-        records.map.remove(slot)
-        records.map.add([slot], cells)
-        records.place(graph, [slot])
+    nodes, found = graph.nodes, []
+    for records in tables:
+        own = slots[slots < len(records.rows)]
+        own = own[records.rows["node_id"][own] == nodes.ids[own]]
+        of, centres, scores = records.map.take(own)
+        T = T_new_old[_seen_from(nodes, own, of, centres)]
+        new = (T[:, :3, :3] @ centres.astype(np.float64)[:, :, None])[:, :, 0] + T[:, :3, 3]
+        found.append((records, own, of, new.astype(np.float32), scores))
+    moved = graph.move_nodes(slots, T_new_old)
+    main = dict(zip(slots.tolist(), moved))
+    for records, own, of, centres, scores in found:
+        records.map.put(own, of, centres, scores)
+        records.map.add(own, records.map.cells_of([nodes.surface(slot) for slot in own.tolist()]))
+        records.place(graph, own)
+        for slot in own.tolist():
+            row, T_main = records.rows[slot], main[slot]
+            row["view_camera"] = row["view_camera"] @ T_main[:3, :3].T + T_main[:3, 3]
+            row["through_frames"] = 0
+        records.recent.clear()  # of frames that may have moved, too
+    return moved
+
+
+def _seen_from(nodes: NodeTable, slots: Int64, of: Int64, places: Float32) -> UInt16:
+    """The keyframe (m,) of a surface point near each place.
+
+    Args:
+        nodes: of the graph.
+        slots: (n,) of nodes.
+        of: (m,) index of the node of each place.
+        places: (m, 3) metres. Where a node has no point near it, the first point of the node tells:
+            their order is random.
+    """
+    counts = nodes.surface_counts[slots]
+    used = np.arange(nodes.surface_points_world.shape[1]) < counts[:, None]
+    keyframes = nodes.surface_keyframes[slots][used]
+    points = nodes.surface_points_world[slots][used]
+    keys = _near_keys(np.repeat(np.arange(len(slots)), counts), points)
+    order = keys.argsort(kind="stable")
+    wanted = _near_keys(of, places)
+    at = np.minimum(keys[order].searchsorted(wanted), max(len(keys) - 1, 0))
+    first = np.where(counts > 0, nodes.surface_keyframes[slots, 0], 0)[of]
+    if not len(keys):
+        return np.asarray(first, np.uint16)
+    return np.where(keys[order][at] == wanted, keyframes[order][at], first).astype(np.uint16)
+
+
+def _near_keys(of: Int64, places: Float32) -> UInt64:
+    """A hash (m,) of the node and the cube of each place (m, 3)."""
+    cubes = np.floor(places.astype(np.float64) / NEAR_M).astype(np.int64)
+    keys = np.concatenate((of[:, None], cubes), axis=1).astype(np.uint64)
+    return np.asarray(keys @ _HASH_FACTORS)
 
 
 def _rebuild(records: NodeRecords, graph: GlobalGraph, slots: Int64) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Protocol
 
 from deworldsg_ros.base.array_file import Arrays
@@ -77,8 +78,20 @@ class Merging(Protocol):
         """
         ...
 
-    def moved(self, graph: GlobalGraph, node_ids: list[int], T_correction: Float64) -> None:
-        """Update the state of nodes that a pose-graph correction (4, 4) moved in the graph."""
+    def move(
+        self, graph: GlobalGraph, slots: Int64, T_new_old: Float64, due: Collection[int]
+    ) -> Float64:
+        """Move nodes as the keyframes that saw them have moved, and merge those that meet then.
+
+        Args:
+            graph: changed.
+            slots: (n,) of the nodes.
+            T_new_old: (k, 4, 4) by the number of the keyframe; see `NodeTable.move`.
+            due: ids of nodes that have still to be moved: none of them is merged.
+
+        Returns:
+            (n, 4, 4), how most of each node has moved.
+        """
         ...
 
 

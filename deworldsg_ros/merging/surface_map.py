@@ -244,11 +244,62 @@ class VoxelMap:
 
     def centres(self, owner: int) -> Float32:
         """Centres of an owner's cells, (n, 3) float32, metres."""
-        blocks, masks, _ = self.cells(owner)
-        rows, cells = np.nonzero(cell_bits(masks))
+        rows = self._rows_of(owner)
+        at, cells = np.nonzero(self._bits(rows))
+        return self._centres(at, cells, rows)
+
+    def take(self, owners: Int64) -> tuple[Int64, Float32, Int8]:
+        """Remove n owners.
+
+        Returns:
+            Of each of m cells: its owner, as an index (m,), ascending; its centre (m, 3), metres;
+            its scores (m, SCORES).
+        """
+        table, index_of = self._table, np.full(len(self._counts) + 1, -1)
+        known = owners < len(self._counts)
+        index_of[owners[known]] = np.flatnonzero(known)
+        of = index_of[table.owners[: self._used]]  # that of no owner, -1, is the last: -1
+        rows = np.flatnonzero(of >= 0)
+        rows = rows[of[rows].argsort(kind="stable")]
+        at, cells = np.nonzero(self._bits(rows))
+        found = of[rows[at]], self._centres(at, cells, rows), table.scores[rows[at], :, cells]
+        table.masks[rows] = table.rejected[rows] = 0
+        table.scores[rows], table.owners[rows] = 0, -1
+        self._counts[owners[known]], self._firsts[owners[known]] = 0, -1
+        return found
+
+    def put(self, owners: Int64, of: Int64, points: Float32, scores: Int8) -> None:
+        """Give n owners the cells of points, with scores; of one cell, the highest scores count.
+
+        Args:
+            owners: (n,) owners.
+            of: (m,) index of the owner of each point, ascending.
+            points: (m, 3) metres.
+            scores: (m, SCORES) int8.
+        """
+        starts: Int64 = of.searchsorted(np.arange(len(owners) + 1))
+        self.add(owners, CellSets(*cell_kernels.cells_of(points, starts, self.cell_m)))
+        steps = np.floor(points.astype(np.float64) * (1.0 / self.cell_m)).astype(np.int64)
+        steps += INDEX_BIAS
+        blocks: Int64 = (steps >> 2) @ np.array([1 << 42, 1 << 21, 1])
+        within = (steps & 3) @ np.array([16, 4, 1])
+        sets = CellSets(blocks, np.zeros(len(blocks), np.uint64), starts)
+        rows = cell_kernels.rows_at(self._table[:], owners, sets[:])
+        order = scores[:, SURFACE].argsort(kind="stable")
+        order = order[rows[order] >= 0]
+        self._table.scores[rows[order], :, within[order]] = scores[order]
+        rows = np.unique(rows[order])
+        self._table.rejected[rows] = _masks(self._table.scores[rows, SURFACE] < 0)
+
+    def _bits(self, rows: Int64) -> UInt64:
+        return cell_bits(self._table.masks[rows])
+
+    def _centres(self, at: Int64, cells: Int64, rows: Int64) -> Float32:
+        """Centres of the cells (n,) of blocks, by the index of their row."""
+        blocks = self._table.blocks[rows]
         corners = np.stack([blocks >> 42, (blocks >> 21) & INDEX_MASK, blocks & INDEX_MASK], axis=1)
         within = np.stack([cells >> 4, (cells >> 2) & 3, cells & 3], axis=1)
-        indices = 4 * corners[rows] + within - INDEX_BIAS
+        indices = 4 * corners[at] + within - INDEX_BIAS
         return ((indices + 0.5) * self.cell_m).astype(np.float32)
 
     def add(self, owners: Sequence[int] | Int64, sets: CellSets) -> None:

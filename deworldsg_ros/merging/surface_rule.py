@@ -7,6 +7,8 @@ and nodes are matched one to one. If the classes differ, more overlap is require
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
 from deworldsg_ros.base.array_file import Arrays
@@ -25,8 +27,8 @@ from deworldsg_ros.merging.editing import (
     reject_deleted,
 )
 from deworldsg_ros.merging.life_cycle import LifeCycle
-from deworldsg_ros.merging.matching import Matches, in_one_place, match
-from deworldsg_ros.merging.records import NodeRecords, apply_correction
+from deworldsg_ros.merging.matching import Matches, in_one_place, match, match_nodes
+from deworldsg_ros.merging.records import NodeRecords, move_nodes
 from deworldsg_ros.merging.views import FrameArrays, View, frame_arrays, see, see_nothing, with_seen
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
@@ -141,10 +143,34 @@ class SurfaceMerging:
         """See `Merging.edit`."""
         return self._editor.apply(graph, request, stamp_ns)
 
-    def moved(self, graph: GlobalGraph, node_ids: list[int], T_correction: Float64) -> None:
-        """See `Merging.moved`."""
-        for records in (self._records, self._editor.aside):
-            apply_correction(records, graph, node_ids, T_correction)
+    def move(
+        self, graph: GlobalGraph, slots: Int64, T_new_old: Float64, due: Collection[int]
+    ) -> Float64:
+        """See `Merging.move`."""
+        main = move_nodes([self._records, self._editor.aside], graph, slots, T_new_old)
+        self._unite(graph, self._life_cycle.bring_back(graph, slots), due)
+        return main
+
+    def _unite(self, graph: GlobalGraph, slots: Int64, due: Collection[int]) -> None:
+        """Merge nodes with those that they meet after a move, the best matches first.
+
+        A loop that closes brings together what the camera saw as one object at two places. Frames
+        that showed both have shown that they are two.
+        """
+        records, nodes = self._records, graph.nodes
+        overlaps = records.map.overlaps(records.map.cells_of([nodes.surface(i) for i in slots]))
+        threshold, cell_m = self._config.overlap_threshold, records.map.cell_m
+        scores = match_nodes(nodes, slots, overlaps, threshold, cell_m)
+        rows, columns = scores.nonzero()
+        order = (-scores[rows, columns]).argsort(kind="stable")
+        others = overlaps[0][columns]
+        for a_id, b_id in zip(nodes.ids[slots[rows]][order], nodes.ids[others][order]):
+            a_id, b_id = graph.resolve(int(a_id)), graph.resolve(int(b_id))
+            if a_id == b_id or a_id in due or b_id in due:
+                continue
+            a, b = nodes.slot(a_id), nodes.slot(b_id)
+            if records.node(a) and records.node(b) and records.joint.balance(a, b) >= 0:
+                self._merge_pair(graph, a, b)
 
     def _see(self, graph: GlobalGraph, local: LocalGraph, frame: FrameArrays | None) -> View:
         """Compare the frame with the nodes that may be in view."""

@@ -15,7 +15,6 @@ from deworldsg_ros.poses.odometry import (
     RgbdOdometry,
 )
 from deworldsg_ros.ros.inputs import (
-    POSE_DEPTH,
     WANTED_DEPTH,
     listen_camera_info,
     listen_depth,
@@ -24,7 +23,7 @@ from deworldsg_ros.ros.inputs import (
 from deworldsg_ros.ros.joining import JoiningNode
 from deworldsg_ros.ros.node import run
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.ros.transforms import TransformOutput, put_pose
+from deworldsg_ros.ros.transforms import POSE_DEPTH, TransformOutput, put_pose
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.streams.frames import UnposedAssembler, UnposedFrame
 from deworldsg_ros.streams.poses import set_stamp

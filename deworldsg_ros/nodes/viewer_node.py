@@ -9,17 +9,18 @@ from functools import partial
 from typing import Any
 
 import msgspec
-from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
+from deworldsg_ros.graph.provenance import Trail
 from deworldsg_ros.ros.inputs import listen_rgb
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import ViewerOptions, ViewerParameters
 from deworldsg_ros.ros.qos import reliable, source
+from deworldsg_ros.ros.transforms import Correct, Corrections
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.streams.images import instances_from_message, rgb_from_message
-from deworldsg_ros.streams.poses import pose_from_message, stamp_ns_of
+from deworldsg_ros.streams.poses import stamp_ns_of
 from deworldsg_ros.view.live.camera import FrameJoiner
 from deworldsg_ros.view.live.sources import Sink, open_sink
 from deworldsg_ros.view.live.state import OnError
@@ -64,9 +65,8 @@ class ViewerNode(StageNode):
         self.create_subscription(
             String, "deworldsg/local_graph", self.guarded(self._local), reliable(10)
         )
-        self.create_subscription(
-            PoseStamped, "deworldsg/pose_correction", self.guarded(self._correct), reliable(10)
-        )
+        self._trail, self._world_frame = Trail(), ""
+        Corrections(self, lambda: self._world_frame, self._correct)
         self.listen(
             "instances",
             [source("deworldsg/instances", Image)],
@@ -122,12 +122,17 @@ class ViewerNode(StageNode):
             lambda: local_graph_from_message(wire.decode(text, wire.LocalGraphMessage)),
         )
 
-    def _correct(self, message: Any) -> None:
-        self._viewer.correct(pose_from_message(message)[0], stamp_ns_of(message))
+    def _correct(self, correct: Correct) -> None:
+        change = correct(self._trail)
+        if change is not None:
+            self._viewer.correct(change)
 
     def _add(self, part: str, stamp_ns: int, decode: Callable[[], Any]) -> None:
         view = self._frames.add(part, stamp_ns, decode, time.monotonic())
         if view is not None:
+            self._trail.note(view.stamp_ns, view.T_world_camera, view.T_world_camera)
+            if view.local is not None:
+                self._world_frame = view.local.frame_id
             self._viewer.look(view)
             self.health.published()
 

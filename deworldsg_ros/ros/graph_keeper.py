@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Union
 
 import msgspec
-from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import String
 
 from deworldsg_ros.base.array_file import Arrays
@@ -46,10 +45,11 @@ from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.threads import UpdateTimes, Worker
-from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.ros.transforms import Correct, Corrections
+from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
 from deworldsg_ros.streams.assembler import PendingEvidence
-from deworldsg_ros.streams.poses import ClockGate, jump_text, pose_from_message, stamp_ns_of
+from deworldsg_ros.streams.poses import ClockGate, jump_text
 from deworldsg_ros.wire import messages as wire
 
 # --- The map file of a node: continued at the start, written while the node works and at its end.
@@ -269,48 +269,6 @@ class GraphFiles:
         log.info(message) if written else log.warning(message)
 
 
-# --- Pose corrections after loop closures: the nodes follow.
-
-CORRECTION_TOPIC = "deworldsg/pose_correction"
-
-
-class PoseCorrections:
-    """Applies the corrections, and counts them and the nodes that moved."""
-
-    def __init__(self) -> None:
-        self._corrections = self._nodes = 0
-
-    def apply(self, message: Any, builder: GraphBuilder | None) -> None:
-        """Move the nodes first observed at the stamp or later; the pose is the rigid transform.
-
-        Args:
-            message: PoseStamped.
-            builder: of the graph; None before the first local graph.
-
-        Raises:
-            RefusedInput: ``no_graph``, ``wrong_frame`` or ``invalid_pose``.
-        """
-        T_correction, frame_id = pose_from_message(message)
-        if builder is None:
-            raise RefusedInput(
-                "no_graph", "pose correction before the first local graph: no node to correct"
-            )
-        if frame_id != builder.graph.frame_id:
-            raise RefusedInput(
-                "wrong_frame",
-                f"pose correction is in frame '{frame_id}', expected '{builder.graph.frame_id}'",
-            )
-        self._nodes += len(builder.apply_correction(T_correction, stamp_ns_of(message)))
-        self._corrections += 1
-
-    def values(self) -> dict[str, str]:
-        """Both counts, for /diagnostics."""
-        return {
-            "pose corrections": str(self._corrections),
-            "nodes moved by corrections": str(self._nodes),
-        }
-
-
 # --- Another node that publishes a graph on the same topics.
 
 UPDATES_TOPIC = "scene_graph/updates"
@@ -422,7 +380,7 @@ class GraphKeeper:
         self._clock: ClockGate[LocalGraph] = ClockGate()
         # A continued map is a new session, too: its sequence numbers start again.
         self._session = secrets.token_hex(8)
-        self._corrections = PoseCorrections()
+        self._corrections = self._moved = 0
         self._values: dict[str, str] = {}
         self._times = UpdateTimes(self._node.parameters.output.rate_hz)
         self._running_s = 0.0  # when the job that runs now was submitted
@@ -444,8 +402,8 @@ class GraphKeeper:
         if continued is not None:
             now_s = time.monotonic()
             self.submit(lambda: self._times.changed(now_s, now_s))
-        node.create_subscription(
-            PoseStamped, CORRECTION_TOPIC, node.guarded(self._receive_correction), reliable(10)
+        Corrections(
+            node, self._world_frame, lambda correct: self.submit(lambda: self._correct(correct))
         )
 
     def submit(self, job: Callable[[], None], dropped: Callable[[], None] | None = None) -> None:
@@ -492,7 +450,8 @@ class GraphKeeper:
             **self._values,
             "graph queue": str(self._worker.waiting),
             "evidence waiting": str(len(self._pending)),
-            **self._corrections.values(),
+            "pose corrections": str(self._corrections),
+            "nodes moved by corrections": str(self._moved),
         }
 
     # The methods below run in the graph's thread.
@@ -570,9 +529,13 @@ class GraphKeeper:
             builder.set_rooms(rooms, states)
             self._times.changed(self._running_s, time.monotonic(), can_wait=True)
 
-    def _correct(self, message: Any) -> None:
-        self._corrections.apply(message, self._builder)
-        self._times.changed(self._running_s, time.monotonic())
+    def _correct(self, correct: Correct) -> None:
+        assert self._builder is not None
+        change = correct(self._builder.trail)
+        if change is not None:
+            self._moved += self._builder.follow(change)
+            self._corrections += 1
+            self.changed()
 
     def _run(self, job: _Job) -> None:
         self._running_s = job.submitted_s
@@ -636,9 +599,8 @@ class GraphKeeper:
 
     # The methods below run in the executor's thread.
 
-    def _receive_correction(self, message: Any) -> None:
-        self._node.health.received(CORRECTION_TOPIC)
-        self.submit(lambda: self._correct(message))
+    def _world_frame(self) -> str:
+        return "" if self._builder is None else self._builder.graph.frame_id
 
     def _count_overrun(self, reason: str = "overrun") -> None:
         self._node.drop(reason, f"more messages arrive than are merged: {QUEUE_JOBS} waited")

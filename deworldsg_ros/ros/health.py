@@ -342,6 +342,8 @@ REASONS: dict[str, str] = {
     "for a second lifting_node.",
     "no_graph": "A pose correction arrived before the first local graph, and is ignored. Nothing "
     "has to be done.",
+    "invalid_trajectory": "The poses of a trajectory have no ascending stamps of their own. "
+    "Publish a stamp with each pose; of RTAB-Map, use its `mapGraph` and not its `mapPath`.",
     "unknown_frame": "The graph no longer remembers the frame of relation evidence. Choose a "
     "faster world model or device.",
     "invalid_prediction": "The prediction of a world model is not a probability distribution. "

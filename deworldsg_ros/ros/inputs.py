@@ -14,26 +14,21 @@ from std_msgs.msg import String
 from deworldsg_ros.ros.joining import JoiningNode
 from deworldsg_ros.ros.node import CHECK_PERIOD_S, StageNode
 from deworldsg_ros.ros.qos import AutoSubscription, Source, reliable, source
+from deworldsg_ros.ros.transforms import POSE_DEPTH, TFMessage
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.streams.detections import read_detections
 from deworldsg_ros.streams.frames import TOPICS, FrameAssembler, PosedAssembler
 from deworldsg_ros.streams.poses import stamp_ns_of
 
 try:  # Part of ROS 2, but not of its wheels.
-    from tf2_msgs.msg import TFMessage as TFMessage  # for transform_output, too
-except ImportError:
-    TFMessage = None
-try:  # as tf2_msgs
     from vision_msgs.msg import Detection2DArray as Detection2DArray
 except ImportError:
     Detection2DArray = None
 
 # Takes a message and its stamp in nanoseconds.
 Taker = Callable[[Any, int], None]
-# Messages that DDS keeps: a third of a second of images at 30 Hz; half a second of poses at 200 Hz,
-# and as much camera_info.
+# Messages that DDS keeps: a third of a second of images at 30 Hz.
 IMAGE_DEPTH = 10
-POSE_DEPTH = 100
 # The same for images that a busy node leaves to DDS: the newest, and enough to find the depth image
 # of an RGB image.
 WANTED_DEPTH = 4

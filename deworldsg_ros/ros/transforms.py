@@ -1,20 +1,43 @@
-"""Transforms on /tf: poses of the camera, and objects of the graph."""
+"""Transforms on /tf, and the poses that a SLAM system has corrected."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
+from nav_msgs.msg import Path
 
-from deworldsg_ros.ros.inputs import POSE_DEPTH, TFMessage
+from deworldsg_ros.graph.provenance import Trail, TrailChange
 from deworldsg_ros.ros.node import StageNode
-from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.ros.qos import reliable, source
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.camera import quaternion_from_rotation
-from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.camera import invert_pose, quaternion_from_rotation
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.limits import OBJECT_FRAME
-from deworldsg_ros.streams.poses import TransformTree, set_stamp
+from deworldsg_ros.streams.poses import (
+    MAX_FRAMES,
+    GraphTrajectory,
+    TransformTree,
+    pose_from_message,
+    pose_from_transform,
+    set_stamp,
+    stamp_ns_of,
+    trajectory_from_message,
+)
 from deworldsg_ros.wire import messages as wire
+
+try:  # Part of ROS 2, but not of its wheels.
+    from tf2_msgs.msg import TFMessage as TFMessage
+except ImportError:
+    TFMessage = None
+try:  # Part of RTAB-Map.
+    from rtabmap_msgs.msg import MapGraph as MapGraph
+except ImportError:
+    MapGraph = None
+
+# Messages that DDS keeps: half a second of poses at 200 Hz, and as much camera_info.
+POSE_DEPTH = 100
 
 
 def camera_transform(
@@ -125,3 +148,94 @@ class ObjectTransforms:
         transforms = object_transforms(graph, stamp, self._prefix)
         if transforms:
             self._output.publish(TFMessage(transforms=transforms))
+
+
+# --- What a SLAM system tells when it has corrected its poses.
+
+CORRECTION_TOPIC, TRAJECTORY_TOPIC = "deworldsg/pose_correction", "deworldsg/trajectory"
+Correct = Callable[[Trail], TrailChange | None]
+
+
+class Corrections:
+    """Listens to corrected poses: whole trajectories, one transform since a stamp, or jumps of TF.
+
+    A jump of a transform below the world frame, as of map -> odom when slam_toolbox closes a loop,
+    counts if nobody publishes on the other two topics.
+
+    Args:
+        node: subscribes.
+        world_frame: of the poses of the frames; empty = not known yet.
+        take: called with the correction of a `Trail`; a correction raises RefusedInput.
+    """
+
+    def __init__(
+        self,
+        node: StageNode,
+        world_frame: Callable[[], str],
+        take: Callable[[Correct], None],
+    ) -> None:
+        self._node, self._world_frame, self._take = node, world_frame, take
+        self._graphs = GraphTrajectory()
+        # Of each moving frame below the world: when it was where; and what moves below others.
+        self._last: dict[str, tuple[int, Float64]] = {}
+        self._parents: set[str] = set()
+        node.create_subscription(
+            PoseStamped, CORRECTION_TOPIC, node.guarded(self._correct), reliable(10)
+        )
+        kinds = [Path] if MapGraph is None else [Path, MapGraph]
+        sources = [source(TRAJECTORY_TOPIC, kind) for kind in kinds]
+        node.listen("trajectory", sources, self._follow, "auto", depth=1)
+        if TFMessage is not None and node.parameters.merging.association == "surface":
+            node.create_subscription(
+                TFMessage, "/tf", node.guarded(self._transforms), reliable(POSE_DEPTH)
+            )
+
+    def _correct(self, message: Any) -> None:
+        self._node.health.received(CORRECTION_TOPIC)
+        T_new_old, frame_id = pose_from_message(message)
+        since_ns, world_frame = stamp_ns_of(message), self._world_frame()
+        if not world_frame:
+            raise RefusedInput(
+                "no_graph", "pose correction before the first local graph: no node to correct"
+            )
+        self._check_frame("pose correction", frame_id)
+        self._take(lambda trail: trail.since(T_new_old, since_ns))
+
+    def _follow(self, message: Any) -> None:
+        is_graph = hasattr(message, "poses_id")
+        read = self._graphs.read if is_graph else trajectory_from_message
+        stamps_ns, poses, frame_id = read(message)
+        if len(stamps_ns) and self._world_frame():
+            self._check_frame("trajectory", frame_id)
+            self._take(lambda trail: trail.follow(stamps_ns, poses))
+
+    def _transforms(self, message: Any) -> None:
+        for transform in message.transforms:
+            parent = str(transform.header.frame_id).lstrip("/")
+            child = str(transform.child_frame_id).lstrip("/")
+            if len(self._parents) < MAX_FRAMES:
+                self._parents.add(parent)
+            if parent != self._world_frame() or len(self._last) >= MAX_FRAMES:
+                continue
+            T, stamp_ns = pose_from_transform(transform.transform), stamp_ns_of(transform)
+            last_ns, T_last = self._last.get(child, (stamp_ns, T))
+            self._last[child] = stamp_ns, T
+            # What nothing moves below is the robot itself: it does not jump, it moves.
+            if child in self._parents and (T_last != T).any() and not self._is_told():
+                self._jump(T @ invert_pose(T_last), (last_ns + stamp_ns) // 2 + 1)
+
+    def _jump(self, T_new_old: Float64, at_ns: int) -> None:
+        self._take(lambda trail: trail.jump(T_new_old, at_ns))
+
+    def _is_told(self) -> bool:
+        """Whether somebody publishes corrections."""
+        topics = (CORRECTION_TOPIC, TRAJECTORY_TOPIC)
+        names = (self._node.resolve_topic_name(topic) for topic in topics)
+        return any(self._node.count_publishers(name) for name in names)
+
+    def _check_frame(self, what: str, frame_id: str) -> None:
+        if frame_id != self._world_frame():
+            raise RefusedInput(
+                "wrong_frame",
+                f"{what} is in frame '{frame_id}', expected '{self._world_frame()}'",
+            )

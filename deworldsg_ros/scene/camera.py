@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, UInt8
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt8
 from deworldsg_ros.scene.checks import holds, within
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.limits import (
@@ -317,6 +317,39 @@ def interpolate_pose(T_a: Float64, T_b: Float64, fraction: float) -> Float64:
         quat = math.sin((1 - fraction) * angle) * quat_a + math.sin(fraction * angle) * quat_b
     translation = (1 - fraction) * T_a[:3, 3] + fraction * T_b[:3, 3]
     return pose_from_quaternion(translation, quat / np.linalg.norm(quat))
+
+
+def interpolate_poses(stamps_ns: Int64, T: Float64, at_ns: Int64) -> Float64:
+    """Rigid transforms (n, 4, 4) at n stamps, between those (m, 4, 4) at m ascending ones.
+
+    Linear in translation and rotation matrix, which is then made a rotation: for small turns
+    between the two, as `interpolate_pose`. Beyond the ends, the first and the last.
+    """
+    after = np.clip(stamps_ns.searchsorted(at_ns), 1, max(len(stamps_ns) - 1, 1))
+    after = np.minimum(after, len(stamps_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    length = np.maximum(stamps_ns[after] - stamps_ns[before], 1)
+    part = np.clip((at_ns - stamps_ns[before]) / length, 0.0, 1.0)[:, None, None]
+    found = np.where(part == 1.0, T[after], T[before] + part * (T[after] - T[before]))
+    between = ((part > 0.0) & (part < 1.0)).ravel()
+    found[between, :3, :3] = nearest_rotations(found[between, :3, :3])
+    return np.asarray(found)
+
+
+def nearest_rotations(matrices: Float64) -> Float64:
+    """The rotations (n, 3, 3) nearest to matrices that are nearly some (Newton-Schulz)."""
+    for _ in range(6):
+        squares = matrices.swapaxes(1, 2) @ matrices
+        matrices = matrices @ (1.5 * np.eye(3) - 0.5 * squares)
+    return matrices
+
+
+def invert_poses(T: Float64) -> Float64:
+    """Inverses of rigid transforms (n, 4, 4)."""
+    inverse = np.broadcast_to(np.eye(4), T.shape).copy()
+    turns = T[:, :3, :3].swapaxes(1, 2)
+    inverse[:, :3, :3], inverse[:, :3, 3] = turns, -(turns @ T[:, :3, 3:])[:, :, 0]
+    return inverse
 
 
 # --- The up direction of the world frame, from the poses of the camera.

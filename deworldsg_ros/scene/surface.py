@@ -3,7 +3,8 @@
 Of all distinct points, the sample keeps those with the smallest hash. The hash depends on the point
 alone. So the sample is uniform, and it does not depend on the order of frames, on repeated points,
 or on the order of merges. Points are stored in the order of their hashes; the hashes are computed
-when they are needed, because they would take as much memory as the points.
+when they are needed, because they would take as much memory as the points. Beside each point, its
+keyframe: the number of the pose from which it was seen.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from itertools import accumulate
 import numpy as np
 
 from deworldsg_ros.base.kernels import kernel
-from deworldsg_ros.scene.arrays import Bool, Float32, Int64, UInt32, UInt64
+from deworldsg_ros.scene.arrays import Bool, Float32, Int64, UInt16, UInt32, UInt64
 
 # The constants of SplitMix64.
 _GOLDEN_GAMMA = np.uint64(0x9E3779B97F4A7C15)
@@ -23,40 +24,51 @@ _MIX_2 = np.uint64(0x94D049BB133111EB)
 
 
 NO_POINTS: Float32 = np.zeros((0, 3), np.float32)
+NO_KEYFRAMES: UInt16 = np.zeros(0, np.uint16)
 
 
 def add_points(
     points_world: Float32,
+    keyframes: UInt16,
     counts: Int64,
     rows: Int64,
     point_sets: Sequence[Float32],
+    new_keyframes: UInt16,
 ) -> Bool:
     """Add a set of points (k, 3) to each of n different samples; returns which changed, (n,).
 
     Args:
         points_world: (S, K, 3) float32, metres: S samples of at most K points; the hashes of each
             ascend strictly.
+        keyframes: (S, K) uint16, of each point.
         counts: (S,) int64, number of points of each sample.
         rows: (n,) indices of the samples.
-        point_sets: n sets of points.
+        point_sets: n sets of points, which have m points together.
+        new_keyframes: (m,) uint16, of each of these. A point that is known keeps its own.
     """
     if not len(point_sets) or not points_world.shape[1]:
         return np.zeros(len(point_sets), np.bool_)
     points = np.ascontiguousarray(np.concatenate(point_sets), np.float32)
-    return _add(
-        points_world.view(np.uint32),
-        counts,
+    return add_flat(
+        (points_world, keyframes, counts),
         rows,
-        points.view(np.uint32),
+        points,
+        new_keyframes,
         np.array([0, *accumulate(map(len, point_sets))]),
     )
 
 
-def add_flat(points_world: Float32, counts: Int64, points: Float32, lengths: Int64) -> None:
-    """As `add_points`, to all samples; the sets (m, 3) lie one after the other, of some lengths."""
-    rows, starts = np.arange(len(counts)), np.append(0, np.cumsum(lengths))
-    if points_world.size:
-        _add(points_world.view(np.uint32), counts, rows, points.view(np.uint32), starts)
+def add_flat(
+    samples: tuple[Float32, UInt16, Int64],
+    rows: Int64,
+    points: Float32,
+    new_keyframes: UInt16,
+    starts: Int64,
+) -> Bool:
+    """As `add_points`; set k is points[starts[k] : starts[k + 1]]."""
+    points_world, keyframes, counts = samples
+    bits = points_world.view(np.uint32), keyframes
+    return _add(*bits, counts, rows, points.view(np.uint32), new_keyframes, starts)
 
 
 @kernel
@@ -74,7 +86,15 @@ def _hash(bits: UInt32) -> np.uint64:
 
 
 @kernel
-def _add(bits: UInt32, counts: Int64, rows: Int64, new_bits: UInt32, starts: Int64) -> Bool:
+def _add(
+    bits: UInt32,
+    keyframes: UInt16,
+    counts: Int64,
+    rows: Int64,
+    new_bits: UInt32,
+    new_keyframes: UInt16,
+    starts: Int64,
+) -> Bool:
     capacity = bits.shape[1]
     changed = np.zeros(len(rows), np.bool_)
     # The points that may enter a sample, and their hashes.
@@ -100,14 +120,23 @@ def _add(bits: UInt32, counts: Int64, rows: Int64, new_bits: UInt32, starts: Int
                     place -= gap
                 hashes[place], entering[place] = one, point
             gap //= 2
-        fresh = _enter(bits[row], known, new_bits, entering[:count], hashes)
+        sample = bits[row], keyframes[row]
+        fresh = _enter(*sample, known, new_bits, new_keyframes, entering[:count], hashes)
         changed[index] = fresh > 0
         counts[row] = min(capacity, known + fresh)
     return changed
 
 
 @kernel
-def _enter(bits: UInt32, known: int, new_bits: UInt32, points: Int64, hashes: UInt64) -> int:
+def _enter(
+    bits: UInt32,
+    keyframes: UInt16,
+    known: int,
+    new_bits: UInt32,
+    new_keyframes: UInt16,
+    points: Int64,
+    hashes: UInt64,
+) -> int:
     """Insert points in the order of their hashes; the last ones fall out. Returns their number."""
     places = np.empty(len(points), np.int64)  # of the known points that they come before
     place = fresh = 0
@@ -136,16 +165,20 @@ def _enter(bits: UInt32, known: int, new_bits: UInt32, points: Int64, hashes: UI
             if write < len(bits):
                 for axis in range(3):
                     bits[write, axis] = bits[old, axis]
+                keyframes[write] = keyframes[old]
             old, write = old - 1, write - 1
         if write < len(bits):
             for axis in range(3):
                 bits[write, axis] = new_bits[points[new], axis]
+            keyframes[write] = new_keyframes[points[new]]
         write -= 1
     return fresh
 
 
 @kernel
-def drop_points(points_world: Float32, counts: Int64, rows: Int64, dropped: Bool) -> None:
+def drop_points(
+    points_world: Float32, keyframes: UInt16, counts: Int64, rows: Int64, dropped: Bool
+) -> None:
     """Remove points of n different samples, `dropped` (n, K), but never all points of a sample.
 
     The other arguments are those of `add_points`.
@@ -160,5 +193,6 @@ def drop_points(points_world: Float32, counts: Int64, rows: Int64, dropped: Bool
         for place in range(counts[row]):
             for axis in range(3):
                 points_world[row, kept, axis] = points_world[row, place, axis]
+            keyframes[row, kept] = keyframes[row, place]
             kept += int(not dropped[index, place])
         counts[row] = kept

@@ -9,7 +9,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from deworldsg_ros.scene.arrays import Float32, Float64
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.camera import (
     Intrinsics,
     check_pose,
@@ -65,6 +65,64 @@ def _rigid(position: Any, orientation: Any) -> Float64:
         np.array([position.x, position.y, position.z], np.float64),
         np.array([orientation.x, orientation.y, orientation.z, orientation.w], np.float64),
     )
+
+
+# As many as a day of SLAM has, at a pose a second.
+MAX_TRAJECTORY = 100_000
+
+
+def trajectory_from_message(message: Any) -> tuple[Int64, Float64, str]:
+    """Stamps (m,), poses (m, 4, 4) and the world frame of a `nav_msgs/Path`.
+
+    Raises:
+        RefusedInput: ``invalid_trajectory`` for stamps that do not ascend, or too many; and as
+            `pose_from_message`.
+    """
+    stamps_ns = [stamp_ns_of(pose) for pose in message.poses[: MAX_TRAJECTORY + 1]]
+    return _trajectory(message, stamps_ns, [pose.pose for pose in message.poses])
+
+
+class GraphTrajectory:
+    """Trajectories of the `rtabmap_msgs/MapGraph` messages of one SLAM system, by their fields.
+
+    They have ids of poses, and no stamps. The newest pose of a message is of the time of the
+    message. So a pose has a stamp if the message in which it was the newest one has come.
+    """
+
+    def __init__(self) -> None:
+        self._stamps_ns: dict[int, int] = {}
+
+    def read(self, message: Any) -> tuple[Int64, Float64, str]:
+        """As `trajectory_from_message`, of the poses whose stamps are known; there may be none."""
+        by_id = dict(zip(message.poses_id, message.poses))
+        newest, stamp_ns = max(by_id, default=0), stamp_ns_of(message)
+        if newest > 0 and stamp_ns > max(self._stamps_ns.values(), default=0):
+            self._stamps_ns.setdefault(newest, stamp_ns)
+        if len(self._stamps_ns) > MAX_TRAJECTORY:
+            self._stamps_ns.pop(min(self._stamps_ns))
+        known = {stamp: by_id[i] for i, stamp in self._stamps_ns.items() if i in by_id}
+        stamps_ns = sorted(known)
+        return _trajectory(message, stamps_ns, [known[stamp] for stamp in stamps_ns])
+
+
+def _trajectory(message: Any, stamps_ns: list[int], poses: list[Any]) -> tuple[Int64, Float64, str]:
+    """A trajectory with ascending stamps."""
+    if len(stamps_ns) > MAX_TRAJECTORY:
+        raise RefusedInput(
+            "invalid_trajectory", f"a trajectory has more than {MAX_TRAJECTORY} poses"
+        )
+    stamps = np.array(stamps_ns, np.int64)
+    if (np.diff(stamps) <= 0).any():
+        at = int((np.diff(stamps) <= 0).argmax())
+        raise RefusedInput(
+            "invalid_trajectory",
+            f"pose {at + 1} of a trajectory is at {stamps[at + 1] / 1e9:.3f} s, the one before at "
+            f"{stamps[at] / 1e9:.3f} s: expected ascending stamps of when the robot was there. "
+            "RTAB-Map's mapPath has one stamp for all poses: use its mapGraph",
+        )
+    T = [_rigid(pose.position, pose.orientation) for pose in poses]
+    frame_id = checked_frame_id(str(message.header.frame_id)) or UNNAMED_FRAME
+    return stamps, np.array(T).reshape(-1, 4, 4), frame_id
 
 
 class PoseBuffer:

@@ -49,7 +49,9 @@ begin, done = threading.Barrier(4), []
 def call():
     begin.wait()
     points, counts = np.zeros((1, 8, 3), np.float32), np.zeros(1, np.int64)
-    surface.add_points(points, counts, np.array([0]), [np.ones((3, 3), np.float32)])
+    known, new = np.zeros((1, 8), np.uint16), np.zeros(3, np.uint16)
+    sets = [np.ones((3, 3), np.float32)]
+    surface.add_points(points, known, counts, np.array([0]), sets, new)
     done.append(counts.tolist())
 threads = [threading.Thread(target=call) for _ in range(4)]
 for thread in threads: thread.start()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.merging import set_confirmed
+from support.merging import move_node, set_confirmed
 from support.room_nodes import DESK, DINNER, VOCABULARY, Thing, chair, room, table, thing, vote
 from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 
@@ -381,7 +381,7 @@ def test_many_changes_are_told_in_several_updates() -> None:
     T = np.eye(4)
     T[:3, 3] = [0.0, 0.0, 0.5]
     for node_id in list(ids.values())[1::2]:
-        builder.graph.move_node(node_id, T)
+        move_node(builder.graph, node_id, T)
     updates = 0
     while updates == 0 or builder.waiting:
         update = builder.update()

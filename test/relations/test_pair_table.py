@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import softmax
-from support.merging import set_confirmed
+from support.merging import move_node, set_confirmed
 from support.room_nodes import DESK, DINNER, VOCABULARY, change, room, thing
 
 from deworldsg_ros.graph.graph import GlobalGraph
@@ -152,7 +152,7 @@ def test_pairs_out_of_reach_are_not_related() -> None:
     assert softmax(told["state_logits"])[0] > 0.999
     T = np.eye(4)
     T[0, 3] = 4.4
-    builder.graph.move_node(ids["cup"], T)
+    move_node(builder.graph, ids["cup"], T)
     told = followed.refresh()
     assert set(told) == {apart} and np.isfinite(told[apart]["gap_m"])
 

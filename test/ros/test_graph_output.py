@@ -9,6 +9,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose, PoseWithCovariance, Quaternion, Vector3
 from sensor_msgs.msg import PointField
 from std_msgs.msg import Header
+from support.merging import move_node
 from support.room_nodes import add_node, room, table, thing
 from support.spaces import BLOCK, BLOCK_RGB, seen_room
 from support.view import box_at, make_graph, make_node
@@ -144,7 +145,7 @@ def test_the_text_of_the_pieces_is_that_of_the_plain_encoder(monkeypatch):
     changes = [
         lambda: None,
         lambda: add_node(builder, thing("bowl", 0.0, 0.2, 0.74, 0.2, 0.2, 0.1), rng),
-        lambda: builder.graph.move_node(ids["cup 1"], np.eye(4)),
+        lambda: move_node(builder.graph, ids["cup 1"], np.eye(4)),
         lambda: builder.graph.remove_node(ids["cup 2"]),
     ]
     for change in changes:

@@ -13,20 +13,30 @@ class Samples:
 
     def __init__(self, count: int, capacity: int) -> None:
         self.points_world = np.zeros((count, capacity, 3), np.float32)
+        self.keyframes = np.zeros((count, capacity), np.uint16)
         self.counts = np.zeros(count, np.int64)
 
     def add(self, rows: list[int], point_sets: list[np.ndarray]) -> None:
-        add_points(self.points_world, self.counts, np.array(rows, np.int64), point_sets)
+        keyframes = np.concatenate([keyframes_of(points) for points in point_sets])
+        add_points(*self.arrays(), np.array(rows, np.int64), point_sets, keyframes)
 
-    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.points_world, self.counts
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.points_world, self.keyframes, self.counts
 
     def of(self, row: int) -> tuple[list[int], list[list[float]]]:
         points = self.points(row)
+        # A point keeps its keyframe beside it, wherever it goes.
+        known = self.keyframes[row, : self.counts[row]]
+        np.testing.assert_array_equal(known, keyframes_of(points))
         return [int(_hash(bits)) for bits in points.view(np.uint32)], points.tolist()
 
     def points(self, row: int) -> np.ndarray:
         return self.points_world[row, : self.counts[row]]
+
+
+def keyframes_of(points: np.ndarray) -> np.ndarray:
+    """A number (k,) that each point (k, 3) determines."""
+    return np.abs(points @ [1e3, 1e2, 1e1]).astype(np.uint16)
 
 
 def sample_of(points: np.ndarray, capacity: int) -> Samples:

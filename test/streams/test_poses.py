@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import (
     MAX_FRAMES,
+    GraphTrajectory,
     JumpGate,
     PoseBuffer,
     TransformTree,
@@ -270,3 +272,37 @@ def test_objects_of_the_graph_are_no_frames_of_the_camera():
     add(tree, T0, "map object_1, map object_2")  # a tracker that names bodies so
     assert len(tree) == 4
     assert tree.at(T0, "camera")[0][0, 3] == pytest.approx(2.0)
+
+
+def test_a_graph_of_rtabmap_has_the_stamps_of_the_messages_in_which_its_poses_were_new():
+    def graph(stamp_ns, **poses):
+        items = [SimpleNamespace(position=point(x), orientation=TURN) for x in poses.values()]
+        message = SimpleNamespace(
+            header=header(stamp_ns, "map"), poses_id=[int(i[1:]) for i in poses], poses=items
+        )
+        return message
+
+    TURN = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+
+    def point(x):
+        return SimpleNamespace(x=x, y=0.0, z=0.0)
+
+    def header(stamp_ns, frame_id):
+        stamp = SimpleNamespace(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        return SimpleNamespace(stamp=stamp, frame_id=frame_id)
+
+    read = GraphTrajectory().read
+    # Poses 1 and 2 came before; landmarks have negative ids.
+    assert read(graph(3_000_000_000, n3=0.3, n1=0.1, n2=0.2))[0].tolist() == [3_000_000_000]
+    stamps, poses, frame_id = read(graph(4_000_000_000, n1=0.1, n2=0.2, n3=0.35, n5=0.5))
+    assert (stamps.tolist(), frame_id) == ([3_000_000_000, 4_000_000_000], "map")
+    np.testing.assert_allclose(poses[:, 0, 3], [0.35, 0.5])
+    # A pose that was taken out of the graph; and a message that tells nothing new.
+    assert read(graph(5_000_000_000, n5=0.6))[0].tolist() == [4_000_000_000]
+    assert read(graph(6_000_000_000))[0].tolist() == []
+    landmark = SimpleNamespace(
+        header=header(7_000_000_000, "map"),
+        poses_id=[-4],
+        poses=[SimpleNamespace(position=point(0.0), orientation=TURN)],
+    )
+    assert read(landmark)[0].tolist() == []

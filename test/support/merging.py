@@ -20,6 +20,12 @@ def set_confirmed(graph: GlobalGraph, node_id: int, confirmed: bool) -> None:
     graph.set_existence([node_id], np.array([float(confirmed)]), 0.5)
 
 
+def move_node(graph: GlobalGraph, node_id: int, T: NDArray[np.float64]) -> None:
+    """Move a node by one rigid transform (4, 4), from wherever it was seen."""
+    keyframes = int(graph.nodes.surface_keyframes.max(initial=0)) + 1
+    graph.move_nodes(graph.nodes.slots_of([node_id]), np.broadcast_to(T, (keyframes, 4, 4)))
+
+
 def node_states(
     graph: GlobalGraph, top_k: int, with_points: bool = False
 ) -> dict[int, wire.NodeState]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from support.merging import set_confirmed
+from support.merging import move_node, set_confirmed
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph.pairs import frame_votes
@@ -207,7 +207,7 @@ def change(builder: GraphBuilder, rng: np.random.Generator) -> None:
     elif kind == "move":
         T = np.eye(4)
         T[:3, 3] = rng.normal(0, 0.4, 3)
-        graph.move_node(one, T)
+        move_node(graph, one, T)
     elif kind == "confirm":
         set_confirmed(graph, one, bool(rng.integers(2)))
     elif kind == "add" or len(graph) < 5:

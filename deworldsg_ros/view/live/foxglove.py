@@ -18,7 +18,7 @@ from foxglove import channels, messages
 from deworldsg_ros.client.objects import SceneObject, scene_object
 from deworldsg_ros.graph.extent import horizontal_axes
 from deworldsg_ros.graph.pairs import Pair
-from deworldsg_ros.graph.provenance import SeenSpace
+from deworldsg_ros.graph.provenance import SeenSpace, TrailChange
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.view.colours import QUIET, class_colours, to_rgb
@@ -106,7 +106,7 @@ class FoxgloveServer(foxglove.ServerListener):
     def see(self, space: SeenSpace) -> None:
         """Do nothing: Foxglove shows the graph and the camera."""
 
-    def correct(self, T_correction: Float64, since_ns: int) -> None:
+    def correct(self, change: TrailChange) -> None:
         """Do nothing, as `see`."""
 
     def look(self, view: CameraView) -> None:

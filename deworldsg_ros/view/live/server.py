@@ -20,8 +20,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from deworldsg_ros.base.words import visible
-from deworldsg_ros.graph.provenance import SeenSpace
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.graph.provenance import SeenSpace, TrailChange
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.view.live.camera import CameraView
 from deworldsg_ros.view.live.state import Guard, LiveState, LogOnce, OnError, PageView, scene_of
@@ -138,10 +137,10 @@ class Viewer:
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._seen.set)
 
-    def correct(self, T_correction: Float64, since_ns: int) -> None:
+    def correct(self, change: TrailChange) -> None:
         """Move the room and the way of the camera."""
         with self._lock:
-            self._state.correct(T_correction, since_ns)
+            self._state.correct(change)
         self._wake()
 
     def say(self, why_empty: str) -> None:

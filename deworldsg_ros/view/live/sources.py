@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Protocol
 
 from deworldsg_ros.graph.graph_files import GRAPH_FILE
-from deworldsg_ros.graph.provenance import SeenSpace
+from deworldsg_ros.graph.provenance import SeenSpace, TrailChange
 from deworldsg_ros.pipeline import Pipeline
-from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.view.live.camera import CameraView, view_of
@@ -37,8 +36,8 @@ class Sink(Copy, Protocol):
         """Show a frame of the camera."""
         ...
 
-    def correct(self, T_correction: Float64, since_ns: int) -> None:
-        """Move (4, 4) what the camera saw since a stamp: its poses were corrected."""
+    def correct(self, change: TrailChange) -> None:
+        """Move what the camera saw: its poses were corrected."""
         ...
 
     def say(self, why_empty: str) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from deworldsg_ros.client.objects import Point, SceneObject, scene_object
 from deworldsg_ros.graph.extent import DEFAULT_UP, surface_points
 from deworldsg_ros.graph.pairs import Pair
-from deworldsg_ros.graph.provenance import SeenSpace
+from deworldsg_ros.graph.provenance import SeenSpace, TrailChange
 from deworldsg_ros.graph.surface import Surface
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8, UInt16
 from deworldsg_ros.scene.frame_graph import LocalGraph
@@ -232,17 +232,16 @@ class LiveState:
         for view in space.views():
             self._add(*view)
 
-    def correct(self, T_correction: Float64, since_ns: int) -> None:
-        """Apply a correction (4, 4) of the poses since a stamp to the room and the camera's way."""
+    def correct(self, change: TrailChange) -> None:
+        """Move the room and the camera's way: SLAM has corrected the poses."""
+        stamps_ns = np.array([stamp_ns for stamp_ns, _ in self._places], np.int64)
         self._places = [
-            (stamp_ns, T_correction[:3, :3] @ place + T_correction[:3, 3])
-            if stamp_ns >= since_ns
-            else (stamp_ns, place)
-            for stamp_ns, place in self._places
+            (stamp_ns, T[:3, :3] @ place + T[:3, 3])
+            for (stamp_ns, place), T in zip(self._places, change.at(stamps_ns))
         ]
         self._redrawn += 1
         self._points.clear()  # frames bring them again
-        self._space.move(T_correction, since_ns)
+        self._space.move(change)
         self._surface.clear()
         self._surface_gone = []
         self.see(self._space)

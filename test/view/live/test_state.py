@@ -10,6 +10,7 @@ from support.merging import local_graph
 from support.view import box_at, make_edge, make_graph, make_node, random_graphs, updates_of
 
 from deworldsg_ros.client.objects import scene_object
+from deworldsg_ros.graph.provenance import TrailChange
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import DepthGrid
@@ -295,7 +296,7 @@ def test_a_correction_moves_the_room_and_the_way_since_its_stamp():
     page.look()
     T_correction = np.eye(4)
     T_correction[1, 3] = 1.0
-    state.correct(T_correction, 2)
+    state.correct(TrailChange(np.array([1, 2]), np.stack([np.eye(4), np.eye(4), T_correction])))
     page.look()
     assert page.path == [[0, 0, 0], [10, 1, 0]]
     surface = page.surface
