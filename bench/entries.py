@@ -47,6 +47,7 @@ ENTRIES = {
         Entry("fross", "bench.fross:figures", limit_s=240, takes_s=40),
         Entry("merging_search", "bench.merging:search_figures", limit_s=120, takes_s=5),
         Entry("kitchen", "bench.kitchen:figures", limit_s=240, takes_s=35),
+        Entry("relocalisation", "bench.relocalisation:figures", limit_s=480, takes_s=100),
         Entry("memory", "bench.memory:figures", limit_s=120, takes_s=8),
         Entry("building", "bench.building:figures", limit_s=240, takes_s=38),
         Entry("rooms", "bench.rooms:figures", limit_s=240, takes_s=60),

@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 from support.checkpoints import save_dinov2, save_vjepa2
 from support.pair_rooms import CLASSES, PREDICATES, PairClip, render_room
 
-from deworldsg_ros.checkpoints.cards import BackboneIdentity, relative_box_pair
+from deworldsg_ros.checkpoints.cards import BackboneIdentity, TrainingOptions, relative_box_pair
 from deworldsg_ros.checkpoints.probe_network import load_probe
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations import ClassPairPrior, clip_models, fuse_edges, union_box
@@ -34,7 +34,6 @@ from deworldsg_ros.relations.clip_models import FrozenBackbone, ProbedWorldModel
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.training.clips import LabelledClip
-from deworldsg_ros.training.options import TrainingOptions
 from deworldsg_ros.training.train import train_probe
 
 VOCABULARY = Vocabulary(CLASSES, PREDICATES)

@@ -28,7 +28,7 @@ from deworldsg_ros.relations.paper import ClassPairPrior, candidates
 from deworldsg_ros.scene.arrays import Float64, Int64, softmax_weights
 from deworldsg_ros.scene.camera import UpEstimator, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
+from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary, derived
 from deworldsg_ros.scene.limits import RESTART_NS
 from deworldsg_ros.wire import messages as wire
 
@@ -53,6 +53,7 @@ class GraphBuilder:
         frames: from which frames the nodes and edges come.
         space: the space that the camera has seen as free.
         trail: the poses of the frames.
+        poses_frame: world frame of the local graphs and corrections to come.
         rooms: the rooms of that space, as of the last `find_rooms` or `set_rooms`.
         prior: of class pairs.
         refused: what was left out of the newest frame, in words, by reason.
@@ -92,6 +93,8 @@ class GraphBuilder:
         # How keyframes have moved, and the nodes that have still to follow.
         self._T_new_old, self._due = np.eye(4)[None], list[int]()
         self._newest_ns: int | None = None
+        self.poses_frame = frame_id
+        self._T_graph_world: Float64 | None = None
         self.refused: dict[str, str] = {}
 
     @property
@@ -103,6 +106,40 @@ class GraphBuilder:
     def up(self) -> UpEstimator:
         """Estimates the direction against gravity from the poses of the frames."""
         return self._edges.up
+
+    @property
+    def T_graph_poses(self) -> Float64:  # noqa: N802
+        """From the frame of the newest poses to that of the graph, (4, 4): the drift."""
+        return np.eye(4) if self._drift is None else self._drift.T_graph_poses
+
+    def place(self, T_graph_world: Float64, poses_frame: str) -> None:
+        """Take poses in another world frame from now on; the graph stays in its own.
+
+        Args:
+            T_graph_world: (4, 4), from that frame to the graph's.
+            poses_frame: name of that frame.
+
+        Raises:
+            RefusedInput: ``invalid_pose`` if it is no rigid transform.
+        """
+        check_pose(T_graph_world)
+        self._T_graph_world, self.poses_frame = T_graph_world, poses_frame
+        self.trail.place(T_graph_world)
+
+    def place_as(self, other: GraphBuilder) -> None:
+        """Take poses as a graph in the same frame does."""
+        if other.graph.frame_id == self.graph.frame_id and other._T_graph_world is not None:
+            self.place(other._T_graph_world, other.poses_frame)
+
+    def _placed(self, local: LocalGraph) -> LocalGraph:
+        if self._T_graph_world is None:
+            return local
+        if local.frame_id != self.poses_frame:
+            raise RefusedInput(
+                "wrong_frame",
+                f"local graph is in frame {local.frame_id!r}: expected {self.poses_frame!r}",
+            )
+        return derived(moved(local, self._T_graph_world), frame_id=self.graph.frame_id)
 
     @property
     def newest_ns(self) -> int:
@@ -140,7 +177,7 @@ class GraphBuilder:
                 "out_of_order",
                 f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",
             )
-        local = candidates(self.graph.admit(local), self._relations)
+        local = candidates(self.graph.admit(self._placed(local)), self._relations)
         if self._due or self.trail.is_changing:
             local = self._catch_up(local)
         T_given = local.T_world_camera

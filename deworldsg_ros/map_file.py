@@ -79,6 +79,11 @@ def previous_of(path: Path) -> Path:
     return path.with_name(f"{path.name}.previous")
 
 
+def apart_of(path: Path) -> Path:
+    """Path of the graph of a run that was not found in the map `path`."""
+    return path.with_name(f"{path.name}.apart")
+
+
 def ids_of(path: Path) -> Path:
     """Path of the file that says from which id on no node of the map `path` was ever published."""
     return path.with_name(f"{path.name}.ids")
@@ -118,6 +123,7 @@ def check_paths(map_path: Path | None, others: Iterable[tuple[str, Path]]) -> No
     if map_path is not None:
         files += [("the map", map_path), ("the map's previous generation", previous_of(map_path))]
         files.append(("the map's ids", ids_of(map_path)))
+        files.append(("a run that was not found in the map", apart_of(map_path)))
     try:
         check_different(files)
     except ValueError as error:

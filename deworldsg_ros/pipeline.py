@@ -9,7 +9,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import ParamSpec, Protocol, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, ParamSpec, Protocol, TypeVar
 
 from deworldsg_ros.base.timing import Times, timed, watch
 from deworldsg_ros.checkpoints.catalogue import require_checkpoints
@@ -24,8 +25,11 @@ from deworldsg_ros.relations.stage import RelationReasoner, build_world_model
 from deworldsg_ros.relations.world_model import require_predicates
 from deworldsg_ros.scene.camera import RgbdFrame, UprightFrame
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
 from deworldsg_ros.wire import messages as wire
+
+if TYPE_CHECKING:
+    from deworldsg_ros.relocalisation import Returning
 
 # --- Work ahead of its use, in threads: bounded, in order, and ended with its consumer.
 
@@ -142,6 +146,7 @@ class Pipeline:
 
     Attributes:
         builder: keeps the global graph; None before the first frame, which gives the world frame.
+        returning: to a map; then the graph waits apart until it is found there.
         drops: number of dropped inputs and objects, by reason.
         times_s: seconds of each frame in each stage, in each part of perception, and to
             read it (only `process_all`).
@@ -165,6 +170,7 @@ class Pipeline:
         self.lifting = Lifting(config.lifting)
         self.relations = RelationReasoner(config.relations, world_model)
         self.builder: GraphBuilder | None = None
+        self.returning: Returning | None = None
         self.drops: Counter[str] = Counter()
         self.times_s: dict[str, Times] = {
             name: Times() for name in ("reading", "perception", "lifting", "merging", "relations")
@@ -227,19 +233,39 @@ class Pipeline:
     def _add(self, frame: RgbdFrame, perceived: Perceived) -> FrameResult:
         with timed(self.times_s["lifting"]):
             local = self.lifting.lift_frame(perceived.frame_graph, perceived.instances, frame)
+        returning = self.returning
         if self.builder is None:
-            self.go_on_with(GraphBuilder(self.config, local.vocabulary, local.frame_id))
+            begin = partial(GraphBuilder, self.config) if returning is None else returning.begin
+            self.go_on_with(begin(local.vocabulary, local.frame_id))
         assert self.builder is not None
         with timed(self.times_s["merging"]):
             node_ids = self.builder.integrate(local)
-        self.drops.update(self.builder.refused.keys())
+            self.drops.update(self.builder.refused.keys())
+            if returning is not None and returning.waits:
+                node_ids = self._return(returning, local, node_ids)
         with timed(self.times_s["relations"]):
-            self.builder.add_evidence(self.relations.observe(local, frame.rgb))
+            self._add_evidence(self.relations.observe(local, frame.rgb))
             for evidence in self.relations.drain():
-                self.builder.add_evidence(evidence)
+                self._add_evidence(evidence)
         self.drops.update(perceived.drops)
         self.drops.update(local.drops)
         return FrameResult(perceived, local, node_ids)
+
+    def _return(self, returning: Returning, local: LocalGraph, node_ids: list[int]) -> list[int]:
+        """Continue the map if the graph is found in it; returns the node ids of the frame."""
+        assert self.builder is not None
+        continued = returning.note(self.builder, local)
+        if continued is None:
+            return node_ids
+        self.go_on_with(continued)
+        self.drops.update(returning.refused)
+        return continued.graph.nodes_of_frame(local.stamp_ns) or [0] * len(local)
+
+    def _add_evidence(self, evidence: RelationEvidence) -> None:
+        assert self.builder is not None
+        self.builder.add_evidence(evidence)
+        if self.returning is not None:
+            self.returning.note_evidence(evidence)
 
     def graph(self) -> wire.SceneGraphMessage:
         """The whole graph so far, with surface points.

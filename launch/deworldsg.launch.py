@@ -4,6 +4,8 @@ ros2 launch deworldsg_ros deworldsg.launch.py rgb:=/my/rgb depth:=/my/depth_regi
 
 With one_process:=true, one process runs all four stages (deworldsg_node).
 
+With map:=room.map relocalise:=true, the map of an earlier day goes on, wherever the poses begin.
+
 For a robot without SLAM or odometry, add odometry:=true: odometry_node then computes the poses.
 """
 
@@ -14,7 +16,9 @@ from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
 from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import (
     EnvironmentVariable,
+    IfElseSubstitution,
     LaunchConfiguration,
+    NotEqualsSubstitution,
     PathJoinSubstitution,
 )
 from launch_ros.actions import Node
@@ -24,6 +28,7 @@ from launch_ros.substitutions import FindPackageShare
 PACKAGE = "deworldsg_ros"
 # A node with an error in its configuration ends at once, and is not started again more often.
 RESPAWN_DELAY_S = 2.0
+GRAPH_NODES = ("graph_node", "deworldsg_node")
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 
 # Launch argument, topic in the nodes, content.
@@ -78,12 +83,34 @@ def generate_launch_description() -> LaunchDescription:
             description="start a node again when its process ended; a node whose model never "
             "returns then ends by itself",
         ),
+        DeclareLaunchArgument(
+            "map",
+            default_value="",
+            description="map file that is continued and written; empty = map_path of params_file",
+        ),
+        DeclareLaunchArgument(
+            "relocalise",
+            default_value="false",
+            choices=["true", "false"],
+            description="find this run in the map, wherever its poses begin; false = relocalise "
+            "of params_file",
+        ),
         *(
             DeclareLaunchArgument(name, default_value=topic, description=f"topic of the {content}")
             for name, topic, content in INPUTS
         ),
     ]
     use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
+
+    # What is not given leaves the parameter file as it is: it says again what is said already.
+    nothing = ["use_sim_time:=", LaunchConfiguration("use_sim_time")]
+    path, relocalise = LaunchConfiguration("map"), LaunchConfiguration("relocalise")
+    of_graph = [
+        "-p",
+        IfElseSubstitution(NotEqualsSubstitution(path, ""), ["map_path:=", path], nothing),
+        "-p",
+        IfElseSubstitution(relocalise, "relocalise:=true", nothing),
+    ]
 
     def node(name: str, condition: IfCondition | UnlessCondition) -> Node:
         return Node(
@@ -96,7 +123,10 @@ def generate_launch_description() -> LaunchDescription:
             respawn_delay=RESPAWN_DELAY_S,
             parameters=[{"use_sim_time": use_sim_time}],
             # Given to the node itself, which refuses a missing file; launch would ignore it.
-            arguments=["--ros-args", "--params-file", LaunchConfiguration("params_file")],
+            arguments=[
+                *("--ros-args", "--params-file", LaunchConfiguration("params_file")),
+                *(of_graph if name in GRAPH_NODES else ()),
+            ],
             remappings=[(topic, LaunchConfiguration(argument)) for argument, topic, _ in INPUTS],
             condition=condition,
         )

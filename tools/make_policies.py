@@ -12,8 +12,10 @@ from __future__ import annotations
 import importlib
 import os
 import re
+import shutil
 import socket
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -42,6 +44,8 @@ NODES = sorted(
     key=lambda name: (name == "fleet_link_node", name),
 )
 STAGES = {"use_sim_time": True, "relations.world_model": "fake", "odometry.publish_tf": True}
+# These tell where their graph is in its map.
+GRAPH_NODES = ("graph_node", "deworldsg_node")
 # Options that change topics, in two runs.
 VARIANTS: tuple[dict[str, Any], ...] = (
     STAGES,
@@ -89,11 +93,13 @@ def used() -> Uses:
 
 def _ask(uses: Uses, variant: dict[str, Any], replay: dict[str, Any]) -> None:
     """Start all nodes, add to `uses` what they use, end them."""
-    asking = Node("asking")
+    asking, maps = Node("asking"), tempfile.mkdtemp()
     with socket.create_server(("127.0.0.1", 0)) as free:
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     options = dict.fromkeys(NODES, variant)
     options["replay_node"] = replay
+    for name in GRAPH_NODES:
+        options[name] = {**variant, "relocalise": True, "map_path": f"{maps}/{name}.map"}
     options["region_node"] = {"use_sim_time": True}
     options["fleet_node"] = {"use_sim_time": True, "listen": endpoint}
     options["fleet_link_node"] = {"use_sim_time": True, "connect": endpoint, "robot": "ada"}
@@ -111,6 +117,7 @@ def _ask(uses: Uses, variant: dict[str, Any], replay: dict[str, Any]) -> None:
         node.close()
         node.destroy_node()
     asking.destroy_node()
+    shutil.rmtree(maps)
 
 
 def _started(name: str, options: dict[str, Any]) -> Any:

@@ -34,6 +34,7 @@ from deworldsg_ros.cli.configuration import (
     Poses,
     PoseTopic,
     RecordingPath,
+    Relocalise,
     RgbTopic,
     SaveTrajectory,
     Settings,
@@ -124,6 +125,7 @@ def run(
     pose_noise: PoseNoiseText = "",
     save_trajectory: SaveTrajectory = None,
     map_path: MapFile = None,
+    relocalise: Relocalise = False,
     temporal: Temporal = False,
     timings: Timings = False,
 ) -> None:
@@ -145,6 +147,7 @@ def run(
                 poses=PoseChoice(poses, pose_format, odometry, parse_noise(pose_noise)),
                 trajectory_out=save_trajectory,
                 map_path=map_path,
+                relocalise=relocalise,
                 temporal=temporal,
                 timings=timings,
             ),

@@ -123,7 +123,15 @@ MapFile = Annotated[
         "--map",
         metavar="FILE",
         help="load this map if the file exists, and save the map there at the end; the poses must "
-        "be in the map's world frame",
+        "be in the map's world frame, or --relocalise be given",
+    ),
+]
+Relocalise = Annotated[
+    bool,
+    typer.Option(
+        "--relocalise",
+        help="find the recording in the map (--map) by its objects and surfaces, wherever its "
+        "poses begin; the map stays as it is if that fails",
     ),
 ]
 Temporal = Annotated[

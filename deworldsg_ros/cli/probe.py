@@ -11,12 +11,17 @@ from typing import Annotated, Any, Optional
 import typer
 from rich.console import Console
 
-from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, read_detector_card
+from deworldsg_ros.checkpoints.cards import (
+    DETECTOR_CARD,
+    ClipOrigin,
+    FitOptions,
+    TrainingOptions,
+    read_detector_card,
+)
 from deworldsg_ros.cli.terminal import frame_progress
 from deworldsg_ros.config import RelationsConfig, from_mapping
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
-from deworldsg_ros.training.options import ClipOrigin, FitOptions, TrainingOptions
 
 # Options of the command by the configuration fields that they set, for error messages.
 OPTION_OF = {

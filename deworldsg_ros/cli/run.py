@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack, closing, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from deworldsg_ros.cli.outputs import (
     print_part,
 )
 from deworldsg_ros.cli.terminal import frame_progress, say_instead, stopping_early, working
+from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.config import Config
 from deworldsg_ros.doctor import Finding, find
 from deworldsg_ros.evaluation.temporal import UpdateLog
@@ -48,7 +49,7 @@ from deworldsg_ros.graph.graph_files import write_graph
 from deworldsg_ros.graph.provenance import write_seen, write_space
 from deworldsg_ros.graph_builder import warm_up
 from deworldsg_ros.lifting.stage import Lifting
-from deworldsg_ros.map_file import check_paths, claim_map, continue_map, write_map
+from deworldsg_ros.map_file import apart_of, check_paths, claim_map, continue_map, write_map
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.pipeline import FrameResult, Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
@@ -60,6 +61,7 @@ from deworldsg_ros.recordings.posing import PoseChoice, PosedSource, choose_pose
 from deworldsg_ros.recordings.recording import Recording, detect_kind, open_source
 from deworldsg_ros.recordings.source import RawRoleMessage, Role, Source
 from deworldsg_ros.recordings.writer import check_output, write_mcap
+from deworldsg_ros.relocalisation import Returning
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import (
     ConfigurationError,
@@ -97,6 +99,7 @@ class RunOptions:
         poses: source of the camera poses.
         trajectory_out: TUM file for the poses of the processed frames; None = none.
         map_path: map file to load if it exists and to save at the end; None = none.
+        relocalise: find the recording in the map, wherever its poses begin.
         temporal: whether the report contains the temporal stability of the graph.
         timings: whether the times of the stages are printed.
     """
@@ -111,6 +114,7 @@ class RunOptions:
     poses: PoseChoice = PoseChoice()
     trajectory_out: Path | None = None
     map_path: Path | None = None
+    relocalise: bool = False
     temporal: bool = False
     timings: bool = False
 
@@ -176,6 +180,10 @@ def run_recording(options: RunOptions, console: Console) -> None:
 
 
 def _check_paths(options: RunOptions) -> None:
+    if options.relocalise and (options.map_path is None or options.temporal):
+        raise ConfigurationError(
+            "--relocalise: expected --map FILE, and no --temporal, which follows one graph"
+        )
     files = [(f"the result {name}", options.out / name) for name in outputs.RESULTS]
     if options.trajectory_out is not None:
         files.append(("the trajectory", options.trajectory_out))
@@ -223,7 +231,7 @@ def _run(options: RunOptions, console: Console, prepare: Callable[[], None] = la
             with_detections=config.perception.detector == "topic",
         )
         prepare()
-        pipeline = build_pipeline(config, options.map_path, console)
+        pipeline = build_pipeline(config, options.map_path, console, options.relocalise)
         processed = _process(recording, pipeline, options, console)
     finally:
         source.close()
@@ -244,7 +252,9 @@ def _run(options: RunOptions, console: Console, prepare: Callable[[], None] = la
     return _Ran(recording, pipeline, processed, drops, findings)
 
 
-def build_pipeline(config: Config, map_path: Path | None, console: Console) -> Pipeline:
+def build_pipeline(
+    config: Config, map_path: Path | None, console: Console, relocalise: bool = False
+) -> Pipeline:
     """A pipeline with its models loaded, and with the map's graph if the map file exists."""
     with working(console, LOADING) as status:
         on_compilation(lambda: say_instead(console, status, COMPILING))
@@ -255,8 +265,11 @@ def build_pipeline(config: Config, map_path: Path | None, console: Console) -> P
         warm_up(config)
     if map_path is not None:
         continued = continue_map(config, map_path)
-        if continued is not None:
+        if relocalise:
+            pipeline.returning = Returning(config, continued.builder if continued else None)
+        elif continued is not None:
             pipeline.go_on_with(continued.builder)
+        if continued is not None:
             if continued.newest:
                 console.print(continued.message, highlight=False, soft_wrap=True)
             else:
@@ -326,8 +339,10 @@ def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
     pipeline, processed = ran.pipeline, ran.processed
     if pipeline.builder is not None:
         pipeline.builder.find_rooms()
-    graph = pipeline.graph()
-    T_world_cameras = list(processed.poses.values())
+    graph, T_graph_world = pipeline.graph(), np.eye(4)
+    if pipeline.returning is not None and pipeline.returning.found is not None:
+        T_graph_world = pipeline.returning.found.T_map_world
+    T_world_cameras = [T_graph_world @ pose for pose in processed.poses.values()]
     with outputs.writing(options.out, pipeline.config) as staged:
         path = write_graph(staged, graph)
         if pipeline.builder is not None:
@@ -337,7 +352,10 @@ def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
             embeddings = pipeline.builder.graph.embeddings
             write_embeddings(path, wire.ns_from_stamp(graph.stamp), embeddings)
         world_up = pipeline.config.inputs.world_up
-        frames = processed.album.frames
+        frames = [
+            replace(frame, T_world_camera=T_graph_world @ frame.T_world_camera)
+            for frame in processed.album.frames
+        ]
         space = None if pipeline.builder is None else pipeline.builder.space
         outputs.show_graph(staged, graph, console, T_world_cameras, world_up, frames, space)
         outputs.write_report(staged, _report(ran, graph))
@@ -345,7 +363,8 @@ def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
         if options.trajectory_out is not None:
             write_tum(options.trajectory_out, list(processed.poses), T_world_cameras)
         if options.map_path is not None and pipeline.builder is not None:
-            write_map(pipeline.builder, options.map_path)
+            waits = pipeline.returning is not None and pipeline.returning.waits
+            write_map(pipeline.builder, apart_of(options.map_path) if waits else options.map_path)
 
 
 def _report(ran: _Ran, graph: wire.SceneGraphMessage) -> dict[str, Any]:
@@ -394,8 +413,21 @@ def _print_summary(
         _print_timings(console, pipeline.times_s, frames, processed.wall_s)
     outputs.print_files(console, options.out)
     if options.map_path is not None:
-        line = Text.assemble(f"  {options.map_path}  ", ("the map", "dim"))
+        path, what = options.map_path, "the map"
+        if pipeline.returning is not None and pipeline.returning.waits:
+            path, what = apart_of(path), f"the graph; {path} is unchanged"
+        line = Text.assemble(f"  {path}  ", (what, "dim"))
         console.print(line, highlight=False, soft_wrap=True)
+    if pipeline.returning is not None:
+        _print_return(pipeline.returning, pipeline.graph(), console)
+
+
+def _print_return(returning: Returning, graph: wire.SceneGraphMessage, console: Console) -> None:
+    """Print where the recording was found in the map, and what has changed since."""
+    console.print(f"found in the map: {returning.status}", highlight=False, soft_wrap=True)
+    if not returning.waits:
+        for line in returning.changes(SceneGraph(graph)).dated_lines:
+            console.print(f"  {line}", highlight=False, soft_wrap=True)
 
 
 def _times_ms(times_s: dict[str, Times]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -83,6 +84,25 @@ class Changes:
         found += [
             f"relabelled {pair.before.name} as {pair.after.name}{_not_sure(pair.after)}"
             for pair in self.relabelled
+        ]
+        return found
+
+    @property
+    def dated_lines(self) -> list[str]:
+        """The lines of what came, went and moved, with times."""
+        found = [
+            f"new {item.name}{_not_sure(item)} at {_place(item)}, since {_when(item.first_seen_ns)}"
+            for item in self.added
+        ]
+        found += [
+            f"gone {item.name}{_not_sure(item)} from {_place(item)}, "
+            f"seen there until {_when(item.last_seen_ns)}"
+            for item in self.gone
+        ]
+        found += [
+            f"moved {pair.after.name} by {pair.distance_m:.2f} m to {_place(pair.after)}, "
+            f"seen at its old place until {_when(pair.before.last_seen_ns)}"
+            for pair in self.moved
         ]
         return found
 
@@ -238,3 +258,8 @@ def _place(item: SceneObject) -> str:
 
 def _not_sure(item: SceneObject) -> str:
     return "" if item.is_sure else " (not sure)"
+
+
+def _when(stamp_ns: int) -> str:
+    """A time of the local clock, to the second."""
+    return datetime.fromtimestamp(stamp_ns / 1e9).isoformat(" ", "seconds")

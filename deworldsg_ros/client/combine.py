@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
-from collections import Counter, defaultdict
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,7 +14,7 @@ from deworldsg_ros.client.changes import Pairing, matched_by_place
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import Point, SceneObject, scene_object
 from deworldsg_ros.graph.extent import horizontal_axes, rounded, surface_bytes, surface_points
-from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.camera import check_pose, pose_from_quaternion, quaternion_from_rotation
 from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.scene.gaussian import fuse, transform
@@ -26,21 +24,39 @@ from deworldsg_ros.wire import messages as wire
 # --- Finds how the world frame of one graph lies in that of another, from the objects of both.
 #
 # Gravity is known in both, so a heading and a translation are unknown. Two objects in each graph,
-# of equal classes and at equal distances, give a hypothesis. The one that puts most objects onto
-# objects of their class wins; a rare class counts more than a frequent one.
+# whose classes agree, at equal distances, give a hypothesis. Each is judged by a sum of log
+# likelihood ratios over the objects of B: how much better an object of A explains what is found at
+# this place, with these class probabilities, than chance does. A rare class so counts more than a
+# frequent one, and an unsure name less than a sure one. An object may be absent: it was moved, or
+# A has never seen that part. The best are fitted to the centres, then to the surfaces.
 
-# Centres of one object in two sessions differ by less.
-REACH_M = 0.3
-# Objects farther apart than this have no part in a score.
-LIMIT_M = 2.001 * REACH_M
-# Two objects this close give no heading.
-MIN_BASE_M = 0.5
-# Hypotheses that are tried; those of the rarest classes first.
-MOST_HYPOTHESES = 4000
-# Places of objects that are looked up at once: more take more memory than caches have.
-PLACES_AT_ONCE = 1 << 14
+# Standard deviation of the centre of a box in two sessions, horizontal and vertical, and the part
+# of the difference of two sizes that it grows by: of a part of an object, the centre is elsewhere.
+CENTRE_M, HEIGHT_M, PARTLY = 0.1, 0.12, 0.35
+# Probability that an object of B has no counterpart. Half of a room may be new, or moved.
+ABSENT = 0.5
+# A pair of objects counts if its classes agree by more than chance; a wrong name is no proof
+# against it.
+LEAST_AGREEMENT, WRONG_NAME = 1.0, 0.05
+# Objects of one class this near to each other are one piece of evidence: books stand in rows.
+ROW_M = 0.6
+# Two objects this close give no heading; distances differ by less than REACH_M.
+MIN_BASE_M, REACH_M = 0.5, 0.3
+# Hypotheses and pairs of objects that are tried; those of the rarest classes first.
+MOST_HYPOTHESES, MOST_PAIRS, MOST_OBJECTS = 4000, 4000, 400
+# Likelihoods that are computed at once: more take more memory than caches have.
+AT_ONCE = 1 << 18
+# The best hypotheses are judged with centres that are so much less exact, and then fitted.
+COARSE_M, FITTED = 0.15, 12
 # Two hypotheses are different if they differ by one of these.
-OTHER_M, OTHER_RAD = 2 * REACH_M, np.radians(15.0)
+OTHER_M, OTHER_RAD = 0.6, math.radians(15.0)
+# What the best of many wrong hypotheses may reach by chance, in nats. In graphs of other rooms it
+# was 4 (200 pairs of synthetic rooms of the same furniture, `bench.relocalisation`).
+CHANCE_NATS = 12.0
+# Transforms that are fitted to surfaces and returned: those not much less likely than the best.
+SHOWN, LIKELY_NATS = 5, 12.0
+# Steps onto surfaces, each with the distance that still counts, and points of an object.
+SURFACE_REACHES_M, SURFACE_POINTS = (0.25, 0.15, 0.1, 0.06, 0.05), 64
 
 
 @dataclass(frozen=True)
@@ -49,165 +65,252 @@ class Alignment:
 
     Attributes:
         T_a_b: (4, 4) rigid transform, B to A.
-        confidence: from 0 to 1: the matched share of the smaller graph, times the lead over the
-            best other transform. A score, not a probability.
-        matched: number of objects that lie on an object of their class.
+        confidence: from 0 to 1, the share of this transform in the likelihood of all that were
+            found and of `CHANCE_NATS`. A probability only as far as the model holds.
+        matched: number of objects, of the `MOST_OBJECTS` rarest, that lie on one that agrees.
+        evidence_nats: sum of the log likelihood ratios.
     """
 
     T_a_b: Float64
     confidence: float
     matched: int
+    evidence_nats: float
 
 
 def align(a: Sequence[SceneObject], b: Sequence[SceneObject]) -> Alignment:
-    """The transform from B to A.
+    """The most likely transform from B to A.
 
     Raises:
         ClientError: if no two objects of B can be two objects of A.
     """
-    places_a, places_b = _places(a), _places(b)
-    # Motions are around the middle of B. Around a far origin, two motions that put the objects to
-    # the same places would differ by the translation.
-    middle = places_b.mean(axis=0) if len(b) else np.zeros(3)
-    places_b = places_b - middle
-    rarity = _rarity(a, b)
-    numbers: defaultdict[str, int] = defaultdict(itertools.count().__next__)
-    scene = _Scene(places_a, np.array([numbers[item.label] for item in a], np.int64))
-    labels = np.array([numbers[item.label] for item in b], np.int64)
-    objects = _Objects(places_b, labels, rarity)
-    tried = _hypotheses(scene, objects)
-    if not tried:
+    found = alignments(a, b)
+    if not found:
         raise ClientError(
             f"no transform found: graphs of {len(a)} and {len(b)} objects have no two objects of "
             "equal classes at equal distances; give the transform"
         )
-    scores = _scores(tried, scene, objects)
-    order = np.argsort(-scores, kind="stable")
-    best = _refined(tried[order[0]], scene, objects)
-    (score,) = _scores([best], scene, objects)
-    second = next((float(scores[i]) for i in order if _differs(tried[i], best)), 0.0)
-    most = rarity[np.isin(labels, scene.labels)].sum()
-    lead = max(0.0, 1.0 - second / max(score, 1e-9))
-    T_a_b = np.eye(4)
-    axes_a, axes_b = horizontal_axes(a[0].up), horizontal_axes(b[0].up)
-    turn = _turn(best)
-    T_a_b[:3, :3] = axes_a.T @ turn @ axes_b
-    T_a_b[:3, 3] = axes_a.T @ (best[1:] - turn @ middle)
-    confidence = float(min(1.0, score / max(float(most), 1e-9))) * lead
-    return Alignment(T_a_b, confidence, len(_matches(best, scene, objects)))
+    return found[0]
 
 
-def _places(items: Sequence[SceneObject]) -> Float64:
-    """Centres (n, 3): two horizontal coordinates and the height."""
-    axes = horizontal_axes(items[0].up) if items else np.eye(3)
-    return np.array([item.position_m for item in items], np.float64).reshape(-1, 3) @ axes.T
+def alignments(a: Sequence[SceneObject], b: Sequence[SceneObject]) -> list[Alignment]:
+    """The transforms from B to A that are likely, at most `SHOWN`, the most likely first."""
+    if not (a and b):
+        return []
+    evidence = _Evidence(a, b)
+    tried = evidence.hypotheses()
+    if not len(tried):
+        return []
+    best = _different(tried, evidence.screened(tried), FITTED)
+    fitted = np.array([evidence.fitted(motion) for motion in best])
+    fitted = _different(fitted, evidence.scores(fitted), FITTED)
+    scores = evidence.scores(fitted)
+    for row in np.flatnonzero(scores > scores[0] - LIKELY_NATS)[:SHOWN]:
+        motion = evidence.on_surfaces(fitted[row], a, b)
+        score = evidence.scores(motion[None])[0]
+        # Surfaces that are seen from two sides may not fit better than the centres.
+        if score > scores[row] - 1.0:
+            fitted[row], scores[row] = motion, score
+    found = []
+    for row in np.argsort(-scores, kind="stable")[:SHOWN]:
+        others = np.append(np.delete(scores, row), CHANCE_NATS)
+        confidence = 1.0 / (1.0 + np.exp(np.minimum(others - scores[row], 700.0)).sum())
+        matched = int(evidence.is_matched(fitted[row]).sum())
+        T_a_b, score = evidence.transform(fitted[row]), float(scores[row])
+        found.append(Alignment(T_a_b, float(confidence), matched, score))
+    return found
 
 
-def _rarity(a: Sequence[SceneObject], b: Sequence[SceneObject]) -> Float64:
-    """Weight (n,) of each object of B."""
-    counts_a = Counter(item.label for item in a)
-    counts_b = Counter(item.label for item in b)
-    return np.array([(max(counts_a[i.label], 1) * counts_b[i.label]) ** -0.5 for i in b])
+class _Evidence:
+    """What pairs of objects of A and B tell about a motion: heading, and translation (4,).
 
-
-class _Objects(NamedTuple):
-    """The objects of B: places (n, 3), numbers of their classes (n,), and weights (n,)."""
-
-    places: Float64
-    labels: Int64
-    rarity: Float64
-
-    def moved(self, motion: Float64) -> Float64:
-        """The places after a motion."""
-        moved: Float64 = self.places @ _turn(motion).T + motion[1:]
-        return moved
-
-
-class _Scene:
-    """The objects of A, found by place and class.
-
-    Args:
-        places: (n, 3).
-        labels: (n,) numbers of their classes.
+    Motions are around the middle of B. Around a far origin, two motions that put the objects to
+    the same places would differ by the translation.
     """
 
-    def __init__(self, places: Float64, labels: Int64) -> None:
+    def __init__(self, a: Sequence[SceneObject], b: Sequence[SceneObject]) -> None:
+        self._axes_a, self._axes_b = horizontal_axes(a[0].up), horizontal_axes(b[0].up)
+        self.places_a, sizes_a = _places(a, self._axes_a)
+        places_b, sizes_b = _places(b, self._axes_b)
+        self._middle = places_b.mean(axis=0)
+        self.places_b = places_b - self._middle
+        names = {name.label: 0 for item in (*a, *b) for name in item.classes}
+        columns = {name: column for column, name in enumerate(names)}
+        classes_a, classes_b = _classes(a, columns), _classes(b, columns)
+        shares = (classes_a.sum(axis=0) + classes_b.sum(axis=0)) / (len(a) + len(b))
+        classes_a = classes_a / np.maximum(shares, 1e-9)
+        rarest = np.argsort(classes_b @ classes_a.sum(axis=0), kind="stable")[:MOST_OBJECTS]
+        agreement = np.full((len(b), len(a)), 0.0)
+        agreement[rarest] = classes_b[rarest] @ classes_a.T + WRONG_NAME
+        self.of_b, self.of_a = np.nonzero(agreement >= LEAST_AGREEMENT)
+        extent_m = np.ptp(self.places_a[:, :2], axis=0) + 1.0
+        differences = PARTLY * np.abs(sizes_a[self.of_a] - sizes_b[self.of_b])
+        # (P,) of each pair: what the classes tell, over the density of A's objects in a square
+        # metre, and the variances of the horizontal and vertical distance of the centres.
+        self._gains = agreement[self.of_b, self.of_a] / (len(a) / extent_m.prod())
+        self._variances = np.array([[CENTRE_M], [HEIGHT_M]]) ** 2 + differences.T**2
+        self._known, self._starts = np.unique(self.of_b, return_index=True)
+        # The others of many objects tell nothing, for or against.
+        self._weights = np.zeros(len(b))
+        self._weights[rarest] = _weights(self.places_b, classes_b.argmax(axis=1))[rarest]
+
+    def transform(self, motion: Float64) -> Float64:
+        """T_a_b (4, 4) of a motion."""
+        T, turn = np.eye(4), _turn(motion[0])
+        T[:3, :3] = self._axes_a.T @ turn @ self._axes_b
+        T[:3, 3] = self._axes_a.T @ (motion[1:] - turn @ self._middle)
+        return T
+
+    def hypotheses(self) -> Float64:
+        """Motions (n, 4) of pairs of objects that agree, those with the fewest others first."""
+        ends = np.append(self._starts[1:], len(self.of_b))
+        order = np.argsort(ends - self._starts, kind="stable")
+        found, count = [np.zeros((0, 4))], 0
+        for first, second in _pairs(len(order)):
+            i, j = order[first], order[second]
+            p, q = self.places_b[self._known[i]], self.places_b[self._known[j]]
+            step = q - p
+            base = float(np.hypot(step[0], step[1]))
+            if base < MIN_BASE_M:
+                continue
+            sides = (self.of_a[self._starts[x] : ends[x]] for x in (i, j))
+            firsts, seconds = (side.ravel() for side in np.meshgrid(*sides, indexing="ij"))
+            others = self.places_a[seconds] - self.places_a[firsts]
+            fits = np.abs(np.hypot(others[:, 0], others[:, 1]) - base) <= REACH_M
+            fits &= (firsts != seconds) & (np.abs(others[:, 2] - step[2]) <= REACH_M)
+            if not fits.any():
+                continue
+            others, firsts, seconds = others[fits], firsts[fits], seconds[fits]
+            headings = np.arctan2(others[:, 1], others[:, 0]) - np.arctan2(step[1], step[0])
+            middles = (self.places_a[firsts] + self.places_a[seconds]) / 2
+            found.append(_motions(headings, np.broadcast_to((p + q) / 2, middles.shape), middles))
+            count += len(headings)
+            if count >= MOST_HYPOTHESES:
+                break
+        return np.concatenate(found)
+
+    def screened(self, motions: Float64) -> Float64:
+        """The scores (n,) of hypotheses, with inexact centres; of many pairs only the rarest."""
+        ends = np.append(self._starts[1:], len(self.of_b))
+        sizes = ends - self._starts
+        order = np.argsort(sizes, kind="stable")
+        rare = order[np.cumsum(sizes[order]) <= max(MOST_PAIRS, sizes[order[0]])]
+        return self.scores(motions, COARSE_M, np.sort(rare))
+
+    def scores(self, motions: Float64, broad_m: float = 0.0, some: Int64 | None = None) -> Float64:
+        """The sum (n,) of the log likelihood ratios of n motions; `some` of the known objects."""
+        ends = np.append(self._starts[1:], len(self.of_b))
+        known = np.arange(len(self._known)) if some is None else some
+        pairs = np.concatenate([np.arange(self._starts[k], ends[k]) for k in known])
+        starts = np.append(0, np.cumsum((ends - self._starts)[known])[:-1])
+        weights = self._weights[self._known[known]]
+        rest = self._weights.sum() - self._weights[self._known].sum() if some is None else 0.0
+        scores = []
+        at_once = max(1, AT_ONCE // len(pairs))
+        for start in range(0, len(motions), at_once):
+            likelihoods = self._ratios(motions[start : start + at_once], pairs, broad_m)
+            sums = np.add.reduceat(likelihoods, starts, axis=1)
+            scores.append(np.log(ABSENT + (1.0 - ABSENT) * sums) @ weights)
+        return np.concatenate(scores) + rest * math.log(ABSENT)
+
+    def _ratios(self, motions: Float64, pairs: Int64, broad_m: float = 0.0) -> Float64:
+        """Likelihood ratio (n, m) of each pair of objects under each motion."""
+        x, y, z = self.places_b[self.of_b[pairs]].T
+        u, v, w = self.places_a[self.of_a[pairs]].T
+        cos, sin = np.cos(motions[:, :1]), np.sin(motions[:, :1])
+        right, ahead = (
+            cos * x - sin * y + motions[:, 1:2] - u,
+            sin * x + cos * y + motions[:, 2:3] - v,
+        )
+        rise = z + motions[:, 3:] - w
+        flat, high = self._variances[:, pairs] + broad_m**2
+        # A height is no evidence: rooms have floors, and tables one height. It can only disagree.
+        exponents = (right**2 + ahead**2) / flat + rise**2 / high
+        ratios: Float64 = self._gains[pairs] / (2 * math.pi * flat) * np.exp(-0.5 * exponents)
+        return ratios
+
+    def _shares(self, motion: Float64) -> Float64:
+        """Probability (P,) of each pair that both are one object."""
+        pairs = np.arange(len(self.of_b))
+        ratios = (1.0 - ABSENT) * self._ratios(motion[None], pairs)[0]
+        sums = np.bincount(self.of_b, ratios, len(self.places_b))
+        shares: Float64 = ratios / (ABSENT + sums[self.of_b])
+        return shares
+
+    def is_matched(self, motion: Float64) -> Bool:
+        """Whether (n,) each object of B lies on one of A rather than on none."""
+        matched: Bool = np.bincount(self.of_b, self._shares(motion), len(self.places_b)) > 0.5
+        return matched
+
+    def fitted(self, motion: Float64) -> Float64:
+        """The motion of least squares over the centres, each pair with its probability."""
+        for _ in range(4):
+            weights = self._shares(motion) / self._variances[0]
+            if weights.sum() * CENTRE_M**2 < 1e-3:
+                return motion
+            motion = _fit(self.places_b[self.of_b], self.places_a[self.of_a], weights)
+        return motion
+
+    def on_surfaces(
+        self, motion: Float64, a: Sequence[SceneObject], b: Sequence[SceneObject]
+    ) -> Float64:
+        """The motion that puts the surfaces of matched objects onto each other.
+
+        Steps of least squares on the distances of nearest points; far ones count less (Cauchy).
+        Objects that have moved, and sides that one graph alone has seen, have no near points.
+        """
         from scipy.spatial import cKDTree  # slow to import, and only for transforms
 
-        self.places, self.labels = places, labels
-        self._tree = cKDTree(_apart(places, labels))
-        self._rows = {label: np.flatnonzero(labels == label) for label in np.unique(labels)}
-        # Marks at the cells on and around the objects of each class. Few of the places of a wrong
-        # motion have one. Cells with equal hashes share a mark: it tells only where to search.
-        self._marks = np.zeros(1 << (27 * 16 * len(places)).bit_length(), np.bool_)
-        for step in np.ndindex(3, 3, 3):
-            self._marks[self._slots(_cells(places) + step - 1, labels)] = True
-
-    def of_class(self, label: int) -> Int64:
-        """Rows of a class."""
-        return self._rows.get(label, np.zeros(0, np.int64))
-
-    def gaps_m(self, places: Float64, labels: Int64) -> Float64:
-        """Distance (n,) to the nearest object of the same class; infinite beyond 2 `REACH_M`."""
-        gaps = np.full(len(places), np.inf)
-        near = np.flatnonzero(self._marks[self._slots(_cells(places), labels)])
-        of_near = _apart(places[near], labels[near])
-        rows = self._tree.query(of_near, distance_upper_bound=LIMIT_M)[1]
-        known = rows < len(self.places)
-        rows, near = rows[known], near[known]
-        gaps[near] = np.linalg.norm(self.places[rows] - places[near], axis=1)
-        return gaps
-
-    def _slots(self, cells: Int64, labels: Int64) -> Int64:
-        """The mark (n,) of each cell (n, 3) and class."""
-        hashes = cells @ np.array([73856093, 19349663, 83492791]) + labels * 2654435761
-        slots: Int64 = (hashes ^ hashes >> 17) & (len(self._marks) - 1)
-        return slots
-
-    def near(self, places: Float64, labels: Int64) -> Int64:
-        """Pairs (m, 2) of rows, of A and of others, of one class and within about `REACH_M`."""
-        found = self._tree.query_ball_point(_apart(places, labels), 1.001 * REACH_M)
-        pairs = [(row, other) for other, rows in enumerate(found) for row in rows]
-        return np.array(pairs, np.int64).reshape(-1, 2)
+        shares = self._shares(motion)
+        likely = shares > 0.5
+        of_a, of_b = np.unique(self.of_a[likely]), np.unique(self.of_b[likely])
+        points_a = _sampled([a[row] for row in of_a], self._axes_a, 4 * SURFACE_POINTS)
+        points_b = _sampled([b[row] for row in of_b], self._axes_b, SURFACE_POINTS) - self._middle
+        if min(len(points_a), len(points_b)) < SURFACE_POINTS:
+            return motion
+        tree = cKDTree(points_a)
+        for reach_m in SURFACE_REACHES_M:
+            moved = points_b @ _turn(motion[0]).T + motion[1:]
+            gaps_m, rows = tree.query(moved, distance_upper_bound=reach_m)
+            near = np.isfinite(gaps_m)
+            if near.sum() < SURFACE_POINTS:
+                return motion
+            weights = 1.0 / (1.0 + (gaps_m[near] / (reach_m / 3)) ** 2)
+            motion = _fit(points_b[near], points_a[rows[near]], weights)
+        return motion
 
 
-def _cells(places: Float64) -> Int64:
-    """The cell (n, 3) of each place."""
-    return np.floor(places / LIMIT_M).astype(np.int64)
+def _places(items: Sequence[SceneObject], axes: Float64) -> tuple[Float64, Float64]:
+    """Centres (n, 3), two horizontal coordinates and the height; length and height (n, 2)."""
+    places = np.array([item.position_m for item in items], np.float64) @ axes.T
+    sizes = [[math.hypot(*item.size_m[:2]), item.size_m[2]] for item in items]
+    return places, np.array(sizes, np.float64)
 
 
-def _apart(places: Float64, labels: Int64) -> Float64:
-    """Places (n, 4) at which objects of different classes are far from each other."""
-    return np.column_stack([places, 1e6 * labels])
+def _classes(items: Sequence[SceneObject], columns: dict[str, int]) -> Float64:
+    """Probability (n, C) of each class that the messages list; also of objects without a name."""
+    classes = np.zeros((len(items), len(columns)))
+    for row, item in enumerate(items):
+        for belief in item.classes:
+            classes[row, columns[belief.label]] += belief.probability
+    return classes
 
 
-def _hypotheses(scene: _Scene, objects: _Objects) -> list[Float64]:
-    """Heading and translation (4,) of pairs of objects, those of rare classes first."""
-    a, b, order = scene.places, objects.places, np.argsort(-objects.rarity, kind="stable")
-    found: list[Float64] = []
-    # A class that only B has is rare, too.
-    known = np.isin(objects.labels[order], scene.labels).tolist()
-    for i, j in _pairs(len(order)):
-        if not (known[i] and known[j]):
-            continue
-        p, q = b[order[i]], b[order[j]]
-        step = q - p
-        base = float(np.hypot(step[0], step[1]))
-        if base < MIN_BASE_M:
-            continue
-        sides = (scene.of_class(int(objects.labels[order[x]])) for x in (i, j))
-        firsts, seconds = (side.ravel() for side in np.meshgrid(*sides, indexing="ij"))
-        others = a[seconds] - a[firsts]
-        fits = np.abs(np.hypot(others[:, 0], others[:, 1]) - base) <= REACH_M
-        fits &= (firsts != seconds) & (np.abs(others[:, 2] - step[2]) <= REACH_M)
-        for k, m, other in zip(firsts[fits], seconds[fits], others[fits]):
-            heading = np.arctan2(other[1], other[0]) - np.arctan2(step[1], step[0])
-            start = np.array([heading, 0.0, 0.0, 0.0])
-            middle = (p + q) / 2 @ _turn(start).T
-            found.append(np.array([heading, *((a[k] + a[m]) / 2 - middle)]))
-        if len(found) >= MOST_HYPOTHESES:
-            break
-    return found
+def _weights(places: Float64, labels: Int64) -> Float64:
+    """Weight (n,) of each object: one over the number of those of its class beside it."""
+    from scipy.spatial import cKDTree  # slow to import, and only for transforms
+
+    # Objects of different classes are far from each other in a fourth direction.
+    apart = np.column_stack([places, 1e6 * labels])
+    counts = cKDTree(apart).query_ball_point(apart, ROW_M, return_length=True)
+    weights: Float64 = 1.0 / counts
+    return weights
+
+
+def _sampled(items: Sequence[SceneObject], axes: Float64, count: int) -> Float64:
+    """Surface points (n, 3) of objects, at most `count` of each, evenly from its sample."""
+    points = [item.surface_m for item in items]
+    kept = [p[np.linspace(0, len(p) - 1, min(len(p), count)).astype(int)] for p in points]
+    return np.concatenate([np.zeros((0, 3)), *kept]) @ axes.T
 
 
 def _pairs(count: int) -> Iterator[tuple[int, int]]:
@@ -217,53 +320,38 @@ def _pairs(count: int) -> Iterator[tuple[int, int]]:
             yield first, total - first
 
 
-def _turn(motion: Float64) -> Float64:
-    cos, sin = np.cos(motion[0]), np.sin(motion[0])
+def _turn(heading: float) -> Float64:
+    cos, sin = math.cos(heading), math.sin(heading)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _matches(motion: Float64, scene: _Scene, objects: _Objects) -> list[tuple[int, int]]:
-    """Nearest pairs of one class within reach, each object once: (row of A, row of B)."""
-    moved = objects.moved(motion)
-    near = scene.near(moved, objects.labels)
-    gaps_m = np.linalg.norm(scene.places[near[:, 0]] - moved[near[:, 1]], axis=1)
-    rows, columns, pairs = set[int](), set[int](), []
-    for at in np.lexsort((near[:, 1], near[:, 0], gaps_m)):
-        row, column = near[at].tolist()
-        if gaps_m[at] <= REACH_M and row not in rows and column not in columns:
-            rows.add(row)
-            columns.add(column)
-            pairs.append((row, column))
-    return pairs
+def _motions(headings: Float64, places: Float64, onto: Float64) -> Float64:
+    """Motions (n, 4) with headings (n,) that put places (n, 3) onto others (n, 3)."""
+    cos, sin = np.cos(headings), np.sin(headings)
+    x, y, z = places.T
+    turned = np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
+    return np.column_stack([headings, onto - turned])
 
 
-def _scores(motions: Sequence[Float64], scene: _Scene, objects: _Objects) -> Float64:
-    """Of each of n motions, the sum of the weights of the objects of B near one of A, (n,)."""
-    scores: list[float] = []
-    at_once = max(1, PLACES_AT_ONCE // len(objects.places))
-    for start in range(0, len(motions), at_once):
-        places = np.stack([objects.moved(motion) for motion in motions[start : start + at_once]])
-        labels = np.tile(objects.labels, len(places))
-        gaps_m = scene.gaps_m(places.reshape(-1, 3), labels).reshape(len(places), -1)
-        near = np.clip(1.0 - gaps_m / (2 * REACH_M), 0.0, 1.0)
-        scores += [float(objects.rarity @ row) for row in near]
-    return np.array(scores)
+def _fit(places: Float64, onto: Float64, weights: Float64) -> Float64:
+    """The motion (4,) of weighted least squares that puts places (n, 3) onto others (n, 3)."""
+    share = weights[:, None] / weights.sum()
+    p0, q0 = (share * places).sum(axis=0), (share * onto).sum(axis=0)
+    x, y = places - p0, onto - q0
+    cross = (share[:, 0] * (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0])).sum()
+    heading = np.arctan2(cross, (share * x[:, :2] * y[:, :2]).sum())
+    return _motions(np.array([heading]), p0[None], q0[None])[0]
 
 
-def _refined(motion: Float64, scene: _Scene, objects: _Objects) -> Float64:
-    """The motion of least squares over the matches, twice."""
-    for _ in range(2):
-        pairs = np.array(_matches(motion, scene, objects), np.int64).reshape(-1, 2)
-        if len(pairs) < 2:
-            return motion
-        p, q = objects.places[pairs[:, 1]], scene.places[pairs[:, 0]]
-        p0, q0 = p.mean(axis=0), q.mean(axis=0)
-        x, y = p - p0, q - q0
-        cross = (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).sum()
-        heading = np.arctan2(cross, (x[:, :2] * y[:, :2]).sum())
-        start = np.array([heading, 0.0, 0.0, 0.0])
-        motion = np.array([heading, *(q0 - p0 @ _turn(start).T)])
-    return motion
+def _different(motions: Float64, scores: Float64, count: int) -> Float64:
+    """The best motions, at most `count`, that differ from each other, the best first."""
+    kept: list[Float64] = []
+    for motion in motions[np.argsort(-scores, kind="stable")[: 40 * count]]:
+        if all(_differs(motion, other) for other in kept):
+            kept.append(motion)
+        if len(kept) == count:
+            break
+    return np.array(kept)
 
 
 def _differs(a: Float64, b: Float64) -> bool:
@@ -273,9 +361,8 @@ def _differs(a: Float64, b: Float64) -> bool:
 
 # --- Merges two graphs into one message: objects of both at one place become one.
 
-# A transform with less confidence is not used unless it is given. Of graphs of one room it was
-# 0.28 and more, of graphs of two rooms 0.006 and less.
-MIN_CONFIDENCE = 0.1
+# A transform with less confidence is not used unless it is given. Two chairs of a ring have a half.
+MIN_CONFIDENCE = 0.9
 # The up directions of both graphs have to agree within this angle after the transform.
 MAX_TILT_RAD = np.radians(5.0)
 # Surface points of a merged object: as many as graph_node keeps, one for each cell.

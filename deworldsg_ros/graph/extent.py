@@ -338,8 +338,11 @@ class NodeBoxes:
         """Move the ends of boxes with their nodes, each by a rigid transform (n, 4, 4)."""
         for node_id, T in zip(node_ids, T_new_old):
             if (ends := self._ends.get(node_id)) is not None:
+                height_m = ends.axes[2] @ ends.center
                 ends.center = T[:3, :3] @ ends.center + T[:3, 3]
                 ends.axes = ends.axes @ T[:3, :3].T
+                risen_m = float(ends.axes[2] @ ends.center - height_m)
+                ends.rests_m = tuple(rest_m + risen_m for rest_m in ends.rests_m)
 
     def followed(self, node_id: int, box: wire.GravityBox) -> wire.GravityBox:
         """The box of a node, down to what it rests on, with the sides that may go on."""

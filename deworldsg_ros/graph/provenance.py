@@ -231,19 +231,22 @@ class TrailChange(NamedTuple):
     Attributes:
         starts_ns: (k,) stamp of the first frame of each keyframe, ascending.
         T_new_old: (k + 1, 4, 4) by the number of the keyframe, from 1; that of 0 is the identity.
+        T_poses: (k + 1, 4, 4), the same of the poses as they came, which drift has not moved.
     """
 
     starts_ns: Int64
     T_new_old: Float64
+    T_poses: Float64
 
     @property
     def moved(self) -> Bool:
         """Whether (k + 1,) what was seen from each keyframe moves."""
         return np.asarray((self.T_new_old != np.eye(4)).any(axis=(1, 2)))
 
-    def at(self, stamps_ns: Int64) -> Float64:
-        """The transforms (n, 4, 4) of what was seen at n stamps."""
-        return self.T_new_old[self.starts_ns.searchsorted(stamps_ns, "right")]
+    def at(self, stamps_ns: Int64, of_poses: bool = False) -> Float64:
+        """The transforms (n, 4, 4) of what was seen at n stamps, or of the poses as they came."""
+        T = self.T_poses if of_poses else self.T_new_old
+        return T[self.starts_ns.searchsorted(stamps_ns, "right")]
 
 
 class Trail:
@@ -267,6 +270,12 @@ class Trail:
         self._T_body_camera: Float64 | None = None
         # Of poses on their way: the change, until when they come, and the last pose before.
         self._coming = np.eye(4), 0, np.eye(4)
+        self._T_graph_world, self._placed_ns = np.eye(4), -1
+
+    def place(self, T_graph_world: Float64) -> None:
+        """Take frames and corrections from now on in a world that lies so (4, 4) in the graph's."""
+        self._T_graph_world = T_graph_world
+        self._placed_ns = int(self._stamps_ns[self._count - 1]) if self._count else -1
 
     @property
     def camera_world(self) -> Float64:
@@ -299,6 +308,7 @@ class Trail:
         if last >= 0 and stamp_ns <= self._stamps_ns[last]:  # the clock was set back
             self._starts_ns = [min(stamp_ns - 1, start) for start in self._starts_ns]
             self._count, self._starts_anew, self.is_changing = 0, True, False
+            self._placed_ns = -1
         if self._count >= MAX_TRAIL:
             self._count //= 2
             for values in (self._stamps_ns, self._poses):
@@ -338,6 +348,7 @@ class Trail:
     def since(self, T_new_old: Float64, since_ns: int) -> TrailChange:
         """The change by one rigid transform (4, 4) of all poses since a stamp."""
         stamps_ns = self._stamps_ns[: self._count]
+        T_new_old = self._T_graph_world @ T_new_old @ invert_pose(self._T_graph_world)
         T = np.where((stamps_ns >= since_ns)[:, None, None], T_new_old, np.eye(4))
         return self._change(T, since_ns)
 
@@ -358,7 +369,7 @@ class Trail:
         near = nearest <= NEAR_FRAME_NS
         if not near.any():
             return None
-        stamps_ns, bodies = stamps_ns[near], T_world_body[near]
+        stamps_ns, bodies = stamps_ns[near], self._T_graph_world @ T_world_body[near]
         given = interpolate_poses(frames, self._poses[: self._count], stamps_ns)
         if self._T_body_camera is None:
             self._T_body_camera = _mounting(bodies, given)
@@ -379,14 +390,15 @@ class Trail:
         """The change if SLAM says only how it moved (4, 4) the pose of a stamp, when a loop closed.
 
         The error is assumed to have grown evenly on the way since the camera was last so near to
-        where it is now: the rotation by the way, then the rest of the translation [O. Dubbelman and
-        B. Browning, "COP-SLAM", IEEE Transactions on Robotics 31(5), 2015]. If it has never been
-        there, then since the beginning.
+        where it is now, or since the beginning: the rotation by the way, then the rest of the
+        translation [O. Dubbelman and B. Browning, "COP-SLAM", IEEE T-RO 31(5), 2015].
         """
-        before = int(self._stamps_ns[: self._count].searchsorted(at_ns))
-        if not before:
+        frames = self._stamps_ns[: self._count]
+        first, before = frames.searchsorted([self._placed_ns + 1, at_ns]).tolist()
+        if before <= first:
             return None
-        places = self._poses[:before, :3, 3]
+        T_new_old = self._T_graph_world @ T_new_old @ invert_pose(self._T_graph_world)
+        places = self._poses[first:before, :3, 3]
         steps = np.diff(places, axis=0)
         way = np.append(0.0, np.cumsum(np.linalg.norm(steps, axis=1)))
         target = T_new_old[:3, :3] @ places[-1] + T_new_old[:3, 3]
@@ -402,10 +414,10 @@ class Trail:
         turned = (turns[:-1] @ steps[:, :, None])[:, :, 0]
         moved = places[0] + np.concatenate((np.zeros((1, 3)), np.cumsum(turned, axis=0)))
         moved += part[:, None] * (target - moved[-1])
-        T[:before, :3, :3] = turns
-        T[:before, :3, 3] = moved - (turns @ places[:, :, None])[:, :, 0]
+        T[first:before, :3, :3] = turns
+        T[first:before, :3, 3] = moved - (turns @ places[:, :, None])[:, :, 0]
         self._expect(T_new_old, at_ns - 1)
-        return self._change(T, int(self._stamps_ns[start]))
+        return self._change(T, int(frames[first + start]))
 
     def _expect(self, T_new_old: Float64, until_ns: int) -> None:
         """Expect poses of the old trajectory, if they can be told from those of the new one."""
@@ -456,16 +468,18 @@ class Trail:
         self._poses[: self._count] = T_new_old @ self._poses[: self._count]
         of = np.clip(frames.searchsorted(starts, "right") - 1, 0, None)
         by_number = np.broadcast_to(np.eye(4), (len(starts) + 1, 4, 4)).copy()
+        of_poses = by_number.copy()
         own = np.flatnonzero((starts >= since_ns) & (starts >= frames[:1]))
         if len(own):
             # The part that the correction of drift has moved it by already is taken back.
             drifts = np.array([self._T_graph_poses[number] for number in own.tolist()])
             drifts[:, :3, :3] = nearest_rotations(drifts[:, :3, :3])
-            by_number[own + 1] = T_new_old[of[own]] @ invert_poses(drifts)
+            of_poses[own + 1] = T_new_old[of[own]]
+            by_number[own + 1] = of_poses[own + 1] @ invert_poses(drifts)
         for number in own.tolist():
             self._T_graph_poses[number] = np.eye(4)
         self._starts_anew = True
-        return TrailChange(starts, by_number)
+        return TrailChange(starts, by_number, of_poses)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Copies by name, for `restore`: the keyframes, and the frames that they began with."""

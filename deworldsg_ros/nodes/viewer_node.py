@@ -9,6 +9,8 @@ from functools import partial
 from typing import Any
 
 import msgspec
+import numpy as np
+from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
@@ -18,7 +20,9 @@ from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import ViewerOptions, ViewerParameters
 from deworldsg_ros.ros.qos import reliable, source
 from deworldsg_ros.ros.transforms import Correct, Corrections
+from deworldsg_ros.scene.camera import pose_from_quaternion
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.streams.images import instances_from_message, rgb_from_message
 from deworldsg_ros.streams.poses import stamp_ns_of
 from deworldsg_ros.view.live.camera import FrameJoiner
@@ -67,6 +71,13 @@ class ViewerNode(StageNode):
         )
         self._trail, self._world_frame = Trail(), ""
         Corrections(self, lambda: self._world_frame, self._correct)
+        self._T_map_world, self._placed_frame = np.eye(4), ""
+        self.create_subscription(
+            TransformStamped,
+            "deworldsg/map_transform",
+            self.guarded(self._place),
+            reliable(1, latched=True),
+        )
         self.listen(
             "instances",
             [source("deworldsg/instances", Image)],
@@ -116,11 +127,27 @@ class ViewerNode(StageNode):
             stamp = msgspec.json.decode(text, type=_Stamped).stamp
         except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
             raise RefusedInput("invalid_message", f"local graph: {error}") from error
-        self._add(
-            "local",
-            wire.ns_from_stamp(stamp),
-            lambda: local_graph_from_message(wire.decode(text, wire.LocalGraphMessage)),
+        self._add("local", wire.ns_from_stamp(stamp), lambda: self._decoded(text))
+
+    def _decoded(self, text: str) -> LocalGraph:
+        """A local graph in the frame of the graph."""
+        local = local_graph_from_message(wire.decode(text, wire.LocalGraphMessage))
+        if local.frame_id != self._placed_frame:
+            return local
+        from deworldsg_ros.poses.drift import moved  # its kernels are slow to load, and rarely used
+
+        return moved(local, self._T_map_world)
+
+    def _place(self, message: Any) -> None:
+        """The graph was found in a map: what was seen so far moves there, and what comes."""
+        translation, turn = message.transform.translation, message.transform.rotation
+        self._T_map_world = pose_from_quaternion(
+            np.array([translation.x, translation.y, translation.z]),
+            np.array([turn.x, turn.y, turn.z, turn.w]),
         )
+        self._placed_frame = message.child_frame_id
+        self._viewer.correct(self._trail.since(self._T_map_world, 0))
+        self._trail.place(self._T_map_world)
 
     def _correct(self, correct: Correct) -> None:
         change = correct(self._trail)

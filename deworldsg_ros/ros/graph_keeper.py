@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import secrets
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Union
-
-import msgspec
-from std_msgs.msg import String
+from typing import TYPE_CHECKING, NamedTuple
 
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.base.files import write_atomically
@@ -24,6 +21,7 @@ from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.map_file import (
     RESERVED_IDS,
     Continued,
+    apart_of,
     check_paths,
     claim_map,
     continue_map,
@@ -34,8 +32,10 @@ from deworldsg_ros.map_file import (
     write_state,
 )
 from deworldsg_ros.ros.graph_output import (
+    UPDATES_TOPIC,
     EmbeddingTopic,
     MakeMarkers,
+    Rivals,
     RoomFinder,
     RoomTopics,
     WholeGraph,
@@ -43,14 +43,18 @@ from deworldsg_ros.ros.graph_output import (
 from deworldsg_ros.ros.health import HIDDEN
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.options import Parameters
-from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.threads import UpdateTimes, Worker
 from deworldsg_ros.ros.transforms import Correct, Corrections
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
+from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
+from deworldsg_ros.scene.limits import APART_SESSION
 from deworldsg_ros.streams.assembler import PendingEvidence
 from deworldsg_ros.streams.poses import ClockGate, jump_text
 from deworldsg_ros.wire import messages as wire
+
+if TYPE_CHECKING:
+    from deworldsg_ros.relocalisation import Found, Returning
+    from deworldsg_ros.ros.transforms import MapTransform
 
 # --- The map file of a node: continued at the start, written while the node works and at its end.
 
@@ -58,6 +62,7 @@ from deworldsg_ros.wire import messages as wire
 MAX_SHARE = 0.02
 # Longest time in which a disk may take a checkpoint, before the map itself is written.
 SLOW_DISK_S = 20.0
+APART = "the graph is not yet found in it"
 # A checkpoint that failed is tried again after this time, also if the graph does not change.
 RETRY_S = 10.0
 
@@ -185,6 +190,7 @@ class GraphFiles:
 
     Attributes:
         map: None without a map.
+        is_apart: whether the graph is not yet found in the map, which stays as it is.
 
     Raises:
         ConfigurationError: if the map file cannot be written, or is that of `save_path`.
@@ -192,8 +198,11 @@ class GraphFiles:
 
     def __init__(self, node: StageNode) -> None:
         self._node = node
+        self.is_apart = False
         options = node.parameters.node
         self._save_path = Path(options.save_path).absolute()
+        if options.relocalise and not options.map_path:
+            raise ConfigurationError("relocalise is true: expected a map_path to be found in")
         self.map: MapKeeper | None = None
         if options.map_path:
             self._check_paths(Path(options.map_path))
@@ -238,12 +247,14 @@ class GraphFiles:
         said = f"{self._save_path}: {nodes}, {edges}"
         if self.map is None:
             return True, said
+        if self.is_apart:
+            return True, f"{said}; map {self.map.path}: unchanged, {APART}"
         saved, about_map = self.map.save(builder)
         return saved, f"{said}; {about_map}"
 
     def changed(self) -> None:
         """Note that the graph differs from the last checkpoint of the map."""
-        if self.map is not None:
+        if self.map is not None and not self.is_apart:
             self.map.changed()
 
     def wait_s(self, now_s: float) -> float | None:
@@ -260,7 +271,11 @@ class GraphFiles:
         if self.map is None:
             return
         written, message = False, f"map {self.map.path}: not written, the graph is busy"
-        if not busy:
+        if self.is_apart:
+            written, message = False, f"map {self.map.path}: unchanged, {APART}"
+            if builder is not None and not busy:
+                message += f"; {self._write_apart(builder, self.map.path)}"
+        elif not busy:
             written, message = self.map.save(builder)
         if written and builder is not None:
             self.map.release(builder.graph.next_id)
@@ -268,68 +283,13 @@ class GraphFiles:
         log = self._node.get_logger()
         log.info(message) if written else log.warning(message)
 
-
-# --- Another node that publishes a graph on the same topics.
-
-UPDATES_TOPIC = "scene_graph/updates"
-# It has ended if it is silent for this time.
-RIVAL_SILENT_S = 10.0
-
-
-class _Named(msgspec.Struct):
-    """What is read of an update."""
-
-    session: Union[str, msgspec.UnsetType] = msgspec.UNSET
-
-
-class Rivals:
-    """Notices another node that publishes updates on the topic of this one: clients see two graphs.
-
-    The middleware also lists publishers of a node that was killed, for a while. So the topic is
-    listened to while it has several publishers, and a message of another session counts.
-
-    Args:
-        node: publishes the updates.
-        session: of its messages.
-        tell: publishes the whole graph, for clients that followed the other node.
-    """
-
-    def __init__(
-        self, node: StageNode, session: Callable[[], str], tell: Callable[[], None]
-    ) -> None:
-        self._node, self._session, self._tell = node, session, tell
-        self._topic = node.resolve_topic_name(UPDATES_TOPIC)
-        self._subscription: Any = None
-        self._heard_s = -math.inf
-
-    def problems(self) -> list[str]:
-        """That there is one, in words. Call it about once a second, in the executor's thread."""
-        several = self._node.count_publishers(self._topic) > 1
-        if time.monotonic() - self._heard_s < RIVAL_SILENT_S:
-            self._tell()
-        if several and self._subscription is None:
-            listen = self._node.guarded(self._hear)
-            self._subscription = self._node.create_subscription(
-                String, self._topic, listen, reliable(5)
-            )
-        elif not several and self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
-            self._subscription = None
-        if time.monotonic() - self._heard_s > RIVAL_SILENT_S:
-            return []
-        return [
-            f"another node publishes a graph on {self._topic}: end one of the two, or give it a "
-            "namespace"
-        ]
-
-    def _hear(self, message: Any) -> None:
+    def _write_apart(self, builder: GraphBuilder, map_path: Path) -> str:
+        path = apart_of(map_path)
         try:
-            session = msgspec.json.decode(message.data, type=_Named).session
-        except (msgspec.MsgspecError, UnicodeError, RecursionError):
-            session = msgspec.UNSET
-        if session != self._session():
-            self._heard_s = time.monotonic()
-            self._node.drop("other_session", f"a message of another node on {self._topic}")
+            write_map(builder, path)
+        except ConfigurationError as error:
+            return str(error)
+        return f"the new graph is {path}: {counted(builder.confirmed, 'node')}"
 
 
 # --- The global graph of a node, in a thread of its own: merged, published, saved.
@@ -339,6 +299,8 @@ class Rivals:
 # Local graphs and evidence that may wait: a second of both at 30 Hz. A graph takes milliseconds a
 # frame, so they wait only while kernels are compiled or a file is written.
 QUEUE_JOBS = 60
+
+MakeBuilder = Callable[[Vocabulary, str], GraphBuilder]
 
 
 class _Job(NamedTuple):
@@ -385,6 +347,7 @@ class GraphKeeper:
         self._times = UpdateTimes(self._node.parameters.output.rate_hz)
         self._running_s = 0.0  # when the job that runs now was submitted
         self._publish_update = node.json_publisher(UPDATES_TOPIC, 50)
+        self._map_transform: MapTransform
         self._rivals = Rivals(node, lambda: self._session, lambda: self.submit(self._tell_again))
         self._whole = WholeGraph(node, markers)
         self._embeddings = EmbeddingTopic(node)
@@ -396,6 +359,10 @@ class GraphKeeper:
         # None until a map or the first local graph gives the world frame and the vocabulary.
         continued = self.files.continued_map()
         self._builder = None if continued is None else continued.builder
+        self._returning: Returning | None = None
+        if node.parameters.node.relocalise:
+            self._begin_apart(self._builder)
+            continued = None
         self._worker = Worker(
             "graph", self._run, size=QUEUE_JOBS, on_overrun=_drop, after=self._publish
         )
@@ -440,6 +407,8 @@ class GraphKeeper:
     def problems(self) -> list[str]:
         """What is wrong with the map, and on the topics, in words."""
         of_map = [] if self.files.map is None else self.files.map.problems()
+        if self._returning is not None and self._returning.waits:
+            of_map.append(f"to be found in the map {self._returning.status}")
         return [*of_map, *self._rivals.problems()]
 
     def values(self) -> dict[str, str]:
@@ -452,6 +421,7 @@ class GraphKeeper:
             "evidence waiting": str(len(self._pending)),
             "pose corrections": str(self._corrections),
             "nodes moved by corrections": str(self._moved),
+            **({} if self._returning is None else {"found in the map": self._returning.status}),
         }
 
     # The methods below run in the graph's thread.
@@ -462,6 +432,11 @@ class GraphKeeper:
         return self._builder
 
     @property
+    def returning(self) -> Returning | None:
+        """The map in which the graph waits to be found, or was; None without `relocalise`."""
+        return self._returning
+
+    @property
     def session(self) -> str:
         """Of the messages: ids of another one may name other objects."""
         return self._session
@@ -470,7 +445,9 @@ class GraphKeeper:
         """Continue with another graph: clients see a new session."""
         if self._builder is not None:
             builder.graph.skip_to(self._builder.graph.next_id)
+            builder.place_as(self._builder)
         self._builder, self._session = builder, secrets.token_hex(8)
+        self._returning, self.files.is_apart = None, False
         self.newest_ns, self._clock, self._pending = 0, ClockGate(), PendingEvidence()
         self._whole.changed(not builder.confirmed)  # objects appear with their first update
         self.changed()
@@ -491,8 +468,13 @@ class GraphKeeper:
 
     def _merge(self, local: LocalGraph) -> None:
         """Merge a local graph, and the evidence that waited for it."""
+        returning = self._returning
         if self._builder is None:
-            self._builder = GraphBuilder(self._node.parameters, local.vocabulary, local.frame_id)
+            begin: MakeBuilder = partial(GraphBuilder, self._node.parameters)
+            begin = begin if returning is None else returning.begin
+            self._builder = begin(local.vocabulary, local.frame_id)
+            if returning is not None and returning.found is not None:
+                self._tell_place(returning.found, local.stamp_ns)
             if self.files.map is not None:  # no map, but a run before may have published some
                 self._builder.graph.skip_to(self.files.map.first_id)
         self._builder.integrate(local)
@@ -505,16 +487,18 @@ class GraphKeeper:
                 self._node.drop("unmatched_evidence", "the clock was set back", lost)
         self.newest_ns = local.stamp_ns
         self.changed()
+        if returning is not None and returning.waits:
+            self._look_for_map(returning, local)
         for evidence in self._pending.take(local.stamp_ns):
             with self._node.refusing():
-                self._builder.add_evidence(evidence)
+                self._add_evidence(self._builder, evidence)
 
     def add_evidence(self, evidence: RelationEvidence) -> None:
         """Add evidence; keep it if its local graph has not arrived."""
         if self._builder is None or evidence.stamp_ns > self.newest_ns:
             self._pending.add(evidence)
             return
-        self._builder.add_evidence(evidence)
+        self._add_evidence(self._builder, evidence)
         self._times.changed(self._running_s, time.monotonic(), can_wait=True)
 
     def _set_rooms(
@@ -535,7 +519,46 @@ class GraphKeeper:
         if change is not None:
             self._moved += self._builder.follow(change)
             self._corrections += 1
+            if self._returning is not None:
+                self._returning.follow(change)
             self.changed()
+
+    def _add_evidence(self, builder: GraphBuilder, evidence: RelationEvidence) -> None:
+        builder.add_evidence(evidence)
+        if self._returning is not None and self._returning.waits:
+            self._returning.note_evidence(evidence)
+
+    def _begin_apart(self, of_map: GraphBuilder | None) -> None:
+        """Let a new graph wait until it is found in the map; without a map, it begins one."""
+        # Rare, and it needs the client.
+        from deworldsg_ros.relocalisation import Returning
+        from deworldsg_ros.ros.transforms import MapTransform
+
+        self._returning = Returning(self._node.parameters, of_map)
+        self._map_transform = MapTransform(self._node)
+        self._builder, self.files.is_apart = None, self._returning.waits
+        if self.files.is_apart:
+            self._session = APART_SESSION + self._session
+
+    def _look_for_map(self, returning: Returning, local: LocalGraph) -> None:
+        """Continue the map if the graph is found in it: for clients, a new session."""
+        assert self._builder is not None
+        continued = returning.note(self._builder, local)
+        if continued is None or returning.found is None:
+            return
+        self._builder, self._session = continued, secrets.token_hex(8)
+        self.files.is_apart = False
+        self._node.get_logger().info(f"found in the map {returning.status}")
+        for reason, count in returning.refused.items():
+            self._node.drop(reason, "a frame from before the graph was found in the map", count)
+        self._tell_place(returning.found, local.stamp_ns)
+        self._whole.changed(not continued.confirmed)
+        self.changed()
+
+    def _tell_place(self, found: Found, stamp_ns: int) -> None:
+        assert self._builder is not None
+        frames = self._builder.graph.frame_id, self._builder.poses_frame
+        self._map_transform.publish(stamp_ns, *frames, found.T_map_world)
 
     def _run(self, job: _Job) -> None:
         self._running_s = job.submitted_s
@@ -600,7 +623,7 @@ class GraphKeeper:
     # The methods below run in the executor's thread.
 
     def _world_frame(self) -> str:
-        return "" if self._builder is None else self._builder.graph.frame_id
+        return "" if self._builder is None else self._builder.poses_frame
 
     def _count_overrun(self, reason: str = "overrun") -> None:
         self._node.drop(reason, f"more messages arrive than are merged: {QUEUE_JOBS} waited")

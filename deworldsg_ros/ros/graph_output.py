@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from array import array
 from collections.abc import Callable, Hashable, Iterable, Sequence
@@ -9,7 +10,7 @@ from contextlib import suppress
 from copy import copy
 from importlib import import_module
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Union
 
 import msgspec
 import numpy as np
@@ -522,3 +523,66 @@ class WholeGraph:
                 self._transforms.publish(snapshot, stamp)
         now_s = time.monotonic()
         self._due_s = max(self._due_s, now_s + (now_s - started_s) / MAX_SHARE)
+
+
+# --- Another node that publishes a graph on the same topics.
+
+UPDATES_TOPIC = "scene_graph/updates"
+# It has ended if it is silent for this time.
+RIVAL_SILENT_S = 10.0
+
+
+class _Named(msgspec.Struct):
+    """What is read of an update."""
+
+    session: Union[str, msgspec.UnsetType] = msgspec.UNSET
+
+
+class Rivals:
+    """Notices another node that publishes updates on the topic of this one: clients see two graphs.
+
+    The middleware also lists publishers of a node that was killed, for a while. So the topic is
+    listened to while it has several publishers, and a message of another session counts.
+
+    Args:
+        node: publishes the updates.
+        session: of its messages.
+        tell: publishes the whole graph, for clients that followed the other node.
+    """
+
+    def __init__(
+        self, node: StageNode, session: Callable[[], str], tell: Callable[[], None]
+    ) -> None:
+        self._node, self._session, self._tell = node, session, tell
+        self._topic = node.resolve_topic_name(UPDATES_TOPIC)
+        self._subscription: Any = None
+        self._heard_s = -math.inf
+
+    def problems(self) -> list[str]:
+        """That there is one, in words. Call it about once a second, in the executor's thread."""
+        several = self._node.count_publishers(self._topic) > 1
+        if time.monotonic() - self._heard_s < RIVAL_SILENT_S:
+            self._tell()
+        if several and self._subscription is None:
+            listen = self._node.guarded(self._hear)
+            self._subscription = self._node.create_subscription(
+                String, self._topic, listen, reliable(5)
+            )
+        elif not several and self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+        if time.monotonic() - self._heard_s > RIVAL_SILENT_S:
+            return []
+        return [
+            f"another node publishes a graph on {self._topic}: end one of the two, or give it a "
+            "namespace"
+        ]
+
+    def _hear(self, message: Any) -> None:
+        try:
+            session = msgspec.json.decode(message.data, type=_Named).session
+        except (msgspec.MsgspecError, UnicodeError, RecursionError):
+            session = msgspec.UNSET
+        if session != self._session():
+            self._heard_s = time.monotonic()
+            self._node.drop("other_session", f"a message of another node on {self._topic}")

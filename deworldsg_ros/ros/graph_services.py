@@ -129,6 +129,7 @@ class GraphServices:
         self._serve("save", Trigger, lambda text: self._save())
         self._serve("clear", Trigger, lambda text: self._clear())
         self._serve("undo", Trigger, lambda text: self._edit(Undo()))
+        self._serve("changes", Trigger, lambda text: self._changes())
 
     def close(self) -> None:
         """End the thread of the questions."""
@@ -245,7 +246,26 @@ class GraphServices:
         graph.space = self._builder.space
         return _json(graph.explain(what).to_dict())
 
+    def _changes(self) -> Callable[[], str]:
+        returning = self._graph.returning
+        if returning is None or returning.waits:
+            raise RefusedInput(
+                "invalid_request",
+                "there is no map in which the graph was found: is relocalise true?"
+                if returning is None
+                else f"to be found in the map {returning.status}",
+            )
+        graph = SceneGraph(self._builder.full())
+        return lambda: _json(returning.changes(graph).to_dict())
+
     def _edit(self, request: GraphEdit) -> str:
+        returning = self._graph.returning
+        if returning is not None and returning.waits:
+            raise RefusedInput(
+                "invalid_request",
+                "the graph is not yet found in its map, and what is edited now would be lost; try "
+                "again when it is",
+            )
         reply = self._builder.edit(request)
         self._graph.changed()
         return _json(reply)

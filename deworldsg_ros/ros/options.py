@@ -30,9 +30,16 @@ class NodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         str,
         option(
             "map file: graph_node continues it if it exists; ~/save and a clean shutdown write it; "
-            "empty = no map. Poses must be in the map's world frame"
+            "empty = no map. Poses must be in the map's world frame, or relocalise be true"
         ),
     ] = ""
+    relocalise: Annotated[
+        bool,
+        option(
+            "find the new run in the map by its objects and surfaces, wherever the poses begin; "
+            "until then the new graph waits apart (needs map_path)"
+        ),
+    ] = False
     map_period_s: Annotated[
         float,
         option(

@@ -239,3 +239,30 @@ class Corrections:
                 "wrong_frame",
                 f"{what} is in frame '{frame_id}', expected '{self._world_frame()}'",
             )
+
+
+class MapTransform:
+    """Publishes how the frame of the poses lies in that of the map: a topic, and /tf_static.
+
+    In TF it is only where tf2_msgs is installed.
+    """
+
+    def __init__(self, node: StageNode) -> None:
+        self._output = node.create_publisher(
+            TransformStamped, "deworldsg/map_transform", reliable(1, latched=True)
+        )
+        self._tf: Any = None
+        if TFMessage is not None:
+            self._tf = node.create_publisher(TFMessage, "/tf_static", reliable(1, latched=True))
+
+    def publish(
+        self, stamp_ns: int, map_frame: str, world_frame: str, T_map_world: Float64
+    ) -> None:
+        """Publish a transform (4, 4)."""
+        message = TransformStamped(child_frame_id=world_frame)
+        message.header.frame_id = map_frame
+        set_stamp(message, stamp_ns)
+        put_pose(T_map_world, message.transform.translation, message.transform.rotation)
+        self._output.publish(message)
+        if self._tf is not None:
+            self._tf.publish(TFMessage(transforms=[message]))

@@ -124,3 +124,7 @@ def check_names(names: Sequence[str]) -> None:
             f"{MAX_NAME_CHARACTERS}"
         )
     check_labels(names)
+
+
+# Sessions of graphs that are not yet found in their map begin with this.
+APART_SESSION = "apart-"

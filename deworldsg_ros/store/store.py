@@ -20,6 +20,7 @@ from deworldsg_ros.client.meanings import is_class
 from deworldsg_ros.client.objects import Rooms
 from deworldsg_ros.graph.graph_files import MAX_GRAPH_BYTES, read_content
 from deworldsg_ros.scene.errors import RefusedInput, StoreError
+from deworldsg_ros.scene.limits import APART_SESSION
 from deworldsg_ros.store.database import (
     Database,
     Head,
@@ -182,7 +183,8 @@ class Batch:
         """Whether a message is the next one; False if it is known. Raises as `StoreWriter.add`."""
         head, session = self.head, _session(message)
         is_known = session == head.session and message.sequence <= head.sequence
-        if session and is_known:
+        # A graph that waits to be found in its map has another frame, and ids that do not last.
+        if (session and is_known) or session.startswith(APART_SESSION):
             return False
         if message.nodes and head.frame_id not in ("", message.frame_id):
             raise RefusedInput(

@@ -19,7 +19,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from deworldsg_ros.base.files import together, write_atomically
-from deworldsg_ros.checkpoints.cards import BOX_INPUTS, ProbeCard
+from deworldsg_ros.checkpoints.cards import (
+    BOX_INPUTS,
+    ClipOrigin,
+    FitOptions,
+    ProbeCard,
+    TrainingOptions,
+)
 from deworldsg_ros.checkpoints.probe_network import (
     PROBE_FILES,
     Probe,
@@ -31,7 +37,6 @@ from deworldsg_ros.relations.clip_models import FrozenBackbone
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.training.clips import LabelledClip, of_length
-from deworldsg_ros.training.options import ClipOrigin, FitOptions, TrainingOptions
 
 # --- Fit of a probe on features: cross-entropy, early stopping, one random seed.
 

@@ -99,6 +99,91 @@ def test_graphs_of_different_rooms_are_not_merged(room):
         combine.combine(room, room, np.ones((4, 4)))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_evidence_of_a_motion_is_the_sum_over_the_objects(seed):
+    """Against plain loops over all pairs of objects."""
+    a, b = objects(12, seed), objects(7, seed + 10)
+    evidence, rng = combine._Evidence(a, b), np.random.default_rng(seed)
+    motions = rng.uniform(-1, 1, (5, 4)) * [3.0, 1.0, 1.0, 0.2]
+    middle = np.mean([item.position_m for item in b], axis=0)
+    listed = [k for item in (*a, *b) for k in item.classes]
+    share = {name: 0.0 for name in {k.label for k in listed}}
+    for k in listed:
+        share[k.label] += k.probability / (len(a) + len(b))
+    places = np.array([item.position_m for item in a])
+    density = len(a) / np.prod(np.ptp(places[:, :2], axis=0) + 1.0)
+    expected = []
+    for heading, *shift in motions:
+        cos, sin = np.cos(heading), np.sin(heading)
+        total = 0.0
+        for item in b:
+            x, y, z = np.subtract(item.position_m, middle)
+            place = np.array([cos * x - sin * y, sin * x + cos * y, z]) + shift
+            ratio = 0.0
+            for other in a:
+                of_a = {k.label: k.probability for k in other.classes}
+                gain = combine.WRONG_NAME + sum(
+                    k.probability * of_a.get(k.label, 0.0) / share[k.label] for k in item.classes
+                )
+                if gain < combine.LEAST_AGREEMENT:
+                    continue
+                lengths = np.hypot(*other.size_m[:2]) - np.hypot(*item.size_m[:2])
+                heights = other.size_m[2] - item.size_m[2]
+                flat = combine.CENTRE_M**2 + (combine.PARTLY * lengths) ** 2
+                high = combine.HEIGHT_M**2 + (combine.PARTLY * heights) ** 2
+                right, ahead, rise = np.subtract(other.position_m, place)
+                exponent = (right**2 + ahead**2) / flat + rise**2 / high
+                ratio += gain / density / (2 * np.pi * flat) * np.exp(-exponent / 2)
+            beside = [
+                o for o in b if o.label == item.label
+                and np.linalg.norm(np.subtract(o.position_m, item.position_m)) <= combine.ROW_M
+            ]  # fmt: skip
+            total += np.log(combine.ABSENT + (1 - combine.ABSENT) * ratio) / len(beside)
+        expected.append(total)
+    assert evidence.scores(motions) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_transform_is_no_better_known_than_the_objects_tell():
+    """A ring of chairs fits in eight ways; one lamp beside it tells which."""
+    angles = np.arange(8) * np.pi / 4
+    ring = [
+        make_node(i + 1, "chair", (2 * np.cos(t), 2 * np.sin(t), 0)) for i, t in enumerate(angles)
+    ]
+    lamp = make_node(9, "lamp", (2.0, 0.7, 0.0))
+    vague = SceneGraph(make_graph(ring))
+    found = combine.alignments(list(vague), list(vague))
+    assert found[0].confidence < 0.5
+    clear = SceneGraph(make_graph([*ring, lamp, make_node(10, "cup", (0.5, -0.3, 0.4))]))
+    found = combine.alignments(list(clear), list(clear))
+    assert found[0].confidence > combine.MIN_CONFIDENCE
+    assert found[0].T_a_b == pytest.approx(np.eye(4), abs=1e-6)
+    assert [item.evidence_nats for item in found] == sorted(
+        (item.evidence_nats for item in found), reverse=True
+    )
+
+
+def test_a_third_of_the_objects_may_have_moved_and_names_may_be_unsure(room):
+    rng = np.random.default_rng(1)
+    nodes = [item.state for item in room]
+    T = rigid_motion(np.array([4.0, 1.0, 0.0]), np.array([0.0, 0.0, 2.2]))
+    changed = []
+    for node in list(SceneGraph(turned(room, T).message)):
+        state = node.state
+        if rng.random() < 1 / 3:
+            shift = rng.uniform(-1.5, 1.5, 3) * [1, 1, 0]
+            state = combine.moved_object(
+                node, rigid_motion(shift, np.zeros(3)), node.frame_id, node.up
+            ).state
+        unsure = [wire.Belief(state.label, 0.4), wire.Belief("thing", 0.3)]
+        changed.append(msgspec.structs.replace(state, named=False, label="object", classes=unsure))
+    found = align(list(room), list(SceneGraph(make_graph(changed))))
+    rest = found.T_a_b @ T
+    assert found.confidence > combine.MIN_CONFIDENCE
+    assert np.linalg.norm(rest[:3, 3]) < 0.1
+    assert rotation_angle_deg(rest[:3, :3]) < 2.0
+    assert len(nodes) > found.matched >= 0.4 * len(nodes)
+
+
 def test_sums_of_a_merge_are_those_that_a_message_may_have():
     most, same = 2**63 - 1, np.eye(4)
     many = SceneGraph(make_graph([make_node(1, "cup", observations=most)]))

@@ -154,7 +154,7 @@ def test_only_different_views_are_kept_and_no_more_than_some() -> None:
     assert len(space) == 2
     T = np.eye(4)
     T[1, 3] = 10.0
-    change = provenance.TrailChange(np.array([60]), np.stack([np.eye(4), T]))
+    change = provenance.TrailChange(np.array([60]), *[np.stack([np.eye(4), T])] * 2)
     space.move(change)  # the views move with their keyframes
     assert space.poses[:, 1, 3].tolist() == [0.0, 10.0]
     for stamp_ns in range(100, 100 + provenance.MAX_VIEWS):

@@ -144,7 +144,7 @@ def test_a_surface_that_grows_is_that_of_all_views_and_one_that_moved_is_made_an
     for name in ("depths_mm", "colours", "poses", "cameras", "stamps_ns"):
         setattr(space, name, getattr(space, name)[3:])  # as when there are too many
     assert len(grown.of(space).kept()[0]) == count
-    space.move(TrailChange(np.zeros(1, np.int64), np.stack([np.eye(4), at(5.0)])))
+    space.move(TrailChange(np.zeros(1, np.int64), *[np.stack([np.eye(4), at(5.0)])] * 2))
     moved = grown.of(space)
     assert moved is not first
     assert moved.kept()[0][:, 0].min() > 2.0

@@ -431,5 +431,10 @@ def test_a_box_reaches_down_to_what_is_seen_beneath(
     low_m = node.box.center_m[2] - node.box.size_m[2] / 2
     assert low_m == pytest.approx(bottom_m, abs=0.008)
     assert node.box.center_m[2] + node.box.size_m[2] / 2 == pytest.approx(0.25, abs=0.01)
-    # Asked again, it is the same.
+    # Asked again, it is the same. With corrected poses it rises as a whole.
     assert builder.full().nodes[0].box == node.box
+    rise = np.eye(4)
+    rise[2, 3] = 0.5
+    builder.apply_correction(rise, 0)
+    (risen,) = builder.full().nodes
+    assert risen.box.center_m[2] - risen.box.size_m[2] / 2 - low_m == pytest.approx(0.5, abs=0.01)

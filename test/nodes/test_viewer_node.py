@@ -1,9 +1,11 @@
 """viewer_node: topics become a graph and joined frames; abnormal messages change nothing."""
 
+import time
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import TransformStamped
 from msgspec.structs import replace
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
@@ -23,6 +25,7 @@ TOPICS = {
     "deworldsg/local_graph": String,
     "deworldsg/instances": Image,
     "rgb/image_raw": Image,
+    "deworldsg/map_transform": TransformStamped,
 }
 
 
@@ -103,3 +106,21 @@ def test_what_is_no_message_is_refused(at, topic):
 def test_an_error_of_the_page_is_counted(at):
     at.refuses("internal_error", lambda: at.viewer.on_error(ZeroDivisionError("odd")))
     assert at.node.health.report(0.0).values["example internal_error"] == "odd"
+
+
+def test_a_graph_that_was_found_in_a_map_brings_its_camera_along(at):
+    at.viewer.correct = Mock()
+    send_frame(at, 1)
+    at.expect(lambda: at.viewer.look.call_count == 1, "the frame")
+    message = TransformStamped(child_frame_id="map")
+    message.header.frame_id = "scene_map"
+    message.transform.translation.x = 2.0
+    at.send(deworldsg__map_transform=message)
+    at.expect(lambda: at.viewer.correct.called, "the transform")
+    T, since_ns = at.viewer.correct.call_args.args
+    assert (T[0, 3], since_ns) == (2.0, 0)
+    time.sleep(module.VIEW_PERIOD_S)
+    send_frame(at, 2)
+    at.expect(lambda: at.viewer.look.call_count == 2, "the frame")
+    before, after = (call.args[0].local for call in at.viewer.look.call_args_list)
+    assert after.means_world - before.means_world == pytest.approx(np.array([[2.0, 0.0, 0.0]]))

@@ -63,8 +63,20 @@ def test_nodes_have_the_parameter_file_remappings_conditions_and_respawn(root_di
         assert node.kwargs["package"] == "deworldsg_ros"
         assert (root_dir / "scripts" / "ros" / node.kwargs["executable"]).is_file()
         # The node itself reads the file, so that a missing one ends its start.
-        *options, file = node.kwargs["arguments"]
+        *options, file = node.kwargs["arguments"][:3]
         assert (options, file.args) == (["--ros-args", "--params-file"], ("params_file",))
+        # Later arguments replace what the file says.
+        more = node.kwargs["arguments"][3:]
+        has_graph = node.kwargs["executable"] in ("graph_node", "deworldsg_node")
+        assert bool(more) == has_graph
+        if has_graph:
+            (_, path, _, relocalise) = more
+            assert path.args[0].args[0].args == ("map",)
+            assert path.args[1][0] == "map_path:="
+            assert (relocalise.args[0].args, relocalise.args[1]) == (
+                ("relocalise",),
+                "relocalise:=true",
+            )
         (extra,) = node.kwargs["parameters"]
         assert list(extra) == ["use_sim_time"]
         assert {topic: value.args[0] for topic, value in node.kwargs["remappings"]} == {
@@ -79,6 +91,7 @@ def test_nodes_have_the_parameter_file_remappings_conditions_and_respawn(root_di
     assert variables[RESPAWN_VARIABLE].args == ("respawn",)
     assert {entity.args[0] for entity in found["DeclareLaunchArgument"]} == {
         *("params_file", "use_sim_time", "namespace", "odometry", "one_process", "respawn"),
+        *("map", "relocalise"),
         *("rgb", "camera_info", "depth", "pose", "detections"),
     }
 

@@ -18,6 +18,7 @@ from support.view import box_at, make_edge, make_graph, make_node, random_graphs
 from deworldsg_ros.cli.store import add_joined
 from deworldsg_ros.client.changes import MOVED_M
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.limits import APART_SESSION
 from deworldsg_ros.store import Store, StoreError, database
 from deworldsg_ros.store.store import DATABASE_FILE, MESSAGES_FILE, StoreWriter, time_ns_from_text
 from deworldsg_ros.wire import messages as wire
@@ -184,6 +185,8 @@ def test_what_does_not_fit_is_refused_and_changes_nothing(tmp_path):
             with pytest.raises(RefusedInput) as refused:
                 writer.add(message)
             assert reason in f"{refused.value.reason} {refused.value}"
+        apart = graph(9, 90.0, [node(7)], session=f"{APART_SESSION}b")
+        assert not writer.add(apart)  # it waits to be found in its map
         assert (tmp_path / MESSAGES_FILE).read_bytes() == before
         assert writer.add(second)  # it goes on
         # A relation with an object that is not there, as in a file of someone else.

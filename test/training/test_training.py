@@ -12,13 +12,12 @@ from support.evaluation import write_dataset
 from support.pair_rooms import PREDICATES, render_room
 from support.sequences import BLOCKS, HEIGHT, WIDTH, write_sequence, write_surface
 
-from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard
+from deworldsg_ros.checkpoints.cards import BackboneIdentity, FitOptions, ProbeCard, TrainingOptions
 from deworldsg_ros.checkpoints.probe_network import load_probe
 from deworldsg_ros.relations import clip_models, union_box
 from deworldsg_ros.relations.clip_models import FrozenBackbone
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.training.clips import ClipChoice, read_clip_folder, read_clips
-from deworldsg_ros.training.options import FitOptions, TrainingOptions
 from deworldsg_ros.training.train import (
     FeatureCache,
     class_weights,

@@ -296,7 +296,9 @@ def test_a_correction_moves_the_room_and_the_way_since_its_stamp():
     page.look()
     T_correction = np.eye(4)
     T_correction[1, 3] = 1.0
-    state.correct(TrailChange(np.array([1, 2]), np.stack([np.eye(4), np.eye(4), T_correction])))
+    state.correct(
+        TrailChange(np.array([1, 2]), *[np.stack([np.eye(4), np.eye(4), T_correction])] * 2)
+    )
     page.look()
     assert page.path == [[0, 0, 0], [10, 1, 0]]
     surface = page.surface
