@@ -40,7 +40,8 @@ def test_an_agent_asks_over_stdio(demo_out):
 
             listed = (await client.list_tools()).tools
             assert {tool.name for tool in listed} == TOOLS
-            assert all("Args:" in (tool.description or "") for tool in listed)
+            with_arguments = [tool for tool in listed if tool.name != "list_rooms"]
+            assert all("Args:" in (tool.description or "") for tool in with_arguments)
             cups = await ask("list_objects", label="cup")
             assert [item["id"] for item in cups["objects"]] == [13, 40]
             (answer, *_) = (await ask("find", question="cup on dining table"))["answers"]

@@ -117,8 +117,8 @@ def test_a_graph_that_was_found_in_a_map_brings_its_camera_along(at):
     message.transform.translation.x = 2.0
     at.send(deworldsg__map_transform=message)
     at.expect(lambda: at.viewer.correct.called, "the transform")
-    T, since_ns = at.viewer.correct.call_args.args
-    assert (T[0, 3], since_ns) == (2.0, 0)
+    (change,) = at.viewer.correct.call_args.args
+    assert change.at(np.array([at.stamp_ns]))[0, 0, 3] == 2.0
     time.sleep(module.VIEW_PERIOD_S)
     send_frame(at, 2)
     at.expect(lambda: at.viewer.look.call_count == 2, "the frame")
