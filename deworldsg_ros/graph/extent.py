@@ -299,7 +299,7 @@ class _Ends:
         if len(self.rests_m) < MIN_RESTS:
             return box
         center, size = np.array(box.center_m), list(box.size_m)
-        rest_m = float(np.median(self.rests_m))
+        rest_m = sorted(self.rests_m)[len(self.rests_m) // 2]
         gap_m = round(float(self.axes[2] @ center) - size[2] / 2 - rest_m, BOX_DECIMALS)
         if not 0 < gap_m <= BEYOND_M:
             return box
@@ -403,7 +403,8 @@ class NodeBoxes:
         near_below = (drops_m > -BEFORE_M) & (drops_m <= BEYOND_M)
         rows_below, heights_m = of[places[below]][near_below], heights_m[near_below]
         for row in np.flatnonzero(np.bincount(rows_below, minlength=1) >= MIN_BELOW):
-            rest_m = float(np.median(heights_m[rows_below == row]))
+            beneath = np.sort(heights_m[rows_below == row])  # np.median takes ten times as long
+            rest_m = float(beneath[len(beneath) // 2])
             known[row].rests_m = (*known[row].rests_m, rest_m)[-RESTS:]
 
     def _measure(self, node_ids: Sequence[int], up_world: Callable[[], Float64]) -> None:
