@@ -20,11 +20,11 @@ from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import ViewerOptions, ViewerParameters
 from deworldsg_ros.ros.qos import reliable, source
 from deworldsg_ros.ros.transforms import Correct, Corrections
-from deworldsg_ros.scene.camera import pose_from_quaternion
+from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.streams.images import instances_from_message, rgb_from_message
-from deworldsg_ros.streams.poses import stamp_ns_of
+from deworldsg_ros.streams.poses import pose_from_transform, stamp_ns_of
 from deworldsg_ros.view.live.camera import FrameJoiner
 from deworldsg_ros.view.live.sources import Sink, open_sink
 from deworldsg_ros.view.live.state import OnError
@@ -140,14 +140,13 @@ class ViewerNode(StageNode):
 
     def _place(self, message: Any) -> None:
         """The graph was found in a map: what was seen so far moves there, and what comes."""
-        translation, turn = message.transform.translation, message.transform.rotation
-        self._T_map_world = pose_from_quaternion(
-            np.array([translation.x, translation.y, translation.z]),
-            np.array([turn.x, turn.y, turn.z, turn.w]),
-        )
+        before, self._T_map_world = self._T_map_world, pose_from_transform(message.transform)
         self._placed_frame = message.child_frame_id
-        self._viewer.correct(self._trail.since(self._T_map_world, 0))
-        self._trail.place(self._T_map_world)
+        # What was placed before, as by a graph_node that has ended, moves by the difference.
+        if not np.array_equal(before, self._T_map_world):
+            change = self._trail.since(invert_pose(before) @ self._T_map_world, 0)
+            self._viewer.correct(change)
+            self._trail.place(self._T_map_world)
 
     def _correct(self, correct: Correct) -> None:
         change = correct(self._trail)

@@ -124,3 +124,11 @@ def test_a_graph_that_was_found_in_a_map_brings_its_camera_along(at):
     at.expect(lambda: at.viewer.look.call_count == 2, "the frame")
     before, after = (call.args[0].local for call in at.viewer.look.call_args_list)
     assert after.means_world - before.means_world == pytest.approx(np.array([[2.0, 0.0, 0.0]]))
+    # Told again, it moves nothing; found elsewhere, by the difference.
+    at.send(deworldsg__map_transform=message)
+    message.transform.translation.x = 3.0
+    at.send(deworldsg__map_transform=message)
+    at.expect(lambda: at.viewer.correct.call_count > 1, "the other transform")
+    (change,) = at.viewer.correct.call_args.args
+    assert at.viewer.correct.call_count == 2
+    assert change.at(np.array([at.stamp_ns]))[0, 0, 3] == pytest.approx(1.0)
