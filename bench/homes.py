@@ -230,7 +230,7 @@ def _meet(a: Rect, b: Rect) -> bool:
 
 
 def _walls(made: Home) -> Float64:
-    """Boxes of what is no room, within an outer wall; of lintels, floor, ceiling and things."""
+    """The boxes that rays hit: walls, lintels above doors, floor, ceiling, and things."""
     rects = np.array([rect for room in made.rects for rect in room])
     low, high = rects[:, :2].min(axis=0) - 0.24, rects[:, 2:].max(axis=0) + 0.24
     columns, rows = np.ceil((high - low) / CELL_M).astype(int)

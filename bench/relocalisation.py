@@ -68,8 +68,8 @@ class Try:
         error_m, error_deg: of the transform, at the middle of the objects.
         same_ids: share of the map's objects of things that stayed that have their ids and places.
         doubles: nodes more than before inside things that stayed.
-        told: things that were moved and are told as moved or gone; and of how many in the map.
-        untrue: things that stayed and are told as moved or gone.
+        told: how many of the moved things are reported as moved or gone, and how many were moved.
+        untrue: how many things are reported as moved or gone although they stayed.
     """
 
     found_s: float | None = None
@@ -100,9 +100,10 @@ def make_map(seed: int, folder: Path) -> Map:
 
 
 def come_back(own: Map, others: Sequence[Place], seed: int) -> tuple[Try, int]:
-    """A run in a room of which a third was moved; and in how many other rooms it was found.
+    """Come back to a room in which a third of the things was moved, and try other rooms' maps, too.
 
-    In its own room, it is looked for as a node does; in the others after 2 and 5 s.
+    The own map is searched as a node does it; the maps of other rooms after 2 and 5 s. The second
+    result is the number of other rooms in which the run was found.
     """
     room, moved = with_moved(own.room, 1 / 3, seed + 40_000)
     poses = look_around(room, LOOK_S, seed + 50_000)

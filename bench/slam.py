@@ -3,8 +3,8 @@
     python bench/slam.py [ROOMS --scan SCAN] [--quick]
 
 A camera goes through a room, and a third of the way again. Its poses drift by 1 m and 5 degrees.
-Then the loop is closed: all poses are true, and the graph is told so. The graph is compared with
-that of the same frames under true poses. Without ROOMS, the shipped recording is used; its
+Then SLAM closes the loop: the graph gets the true poses of all frames. It is compared with a graph
+that was built under true poses. Without ROOMS, the shipped recording is used; its
 detections are those of its ground truth. The cost is that of a synthetic map of 10 000 nodes that
 all move, with 1 000 keyframes (`synthetic_map.py`).
 """
@@ -45,8 +45,8 @@ from deworldsg_ros.wire.follow import GraphReplica  # noqa: E402
 
 SHIPPED = ROOT / "bags" / "demo_room"
 DRIFT_M, DRIFT_DEG = 1.0, 5.0
-# A SLAM system publishes a pose after so many frames, and its own body's: the camera is mounted
-# 20 cm before and 1 m above it, and looks ahead.
+# The SLAM system publishes the pose of the robot's body at every fourth frame. The camera looks
+# ahead from 20 cm before and 1 m above that body.
 EVERY = 4
 T_BODY_CAMERA = np.array([[0, 0, 1, 0.2], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1.0]])
 NODES, KEYFRAMES = 10_000, 1_000
