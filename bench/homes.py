@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from support.spaces import looking
 
 from deworldsg_ros.graph.provenance import GREY, MAX_VIEWS, SeenSpace
 from deworldsg_ros.graph.rooms import RoomMap
@@ -297,18 +298,6 @@ def _spots(
             ):
                 break
         yield float(x), float(y)
-
-
-def looking(position: tuple[float, float, float], degrees: float, down: float) -> Float64:
-    """T_world_camera (4, 4) at a position, z towards an angle in plan, and down by degrees."""
-    angle, pitch = np.deg2rad(degrees), np.deg2rad(down)
-    ahead = np.array([np.cos(angle), np.sin(angle), 0.0])
-    z = np.cos(pitch) * ahead - np.sin(pitch) * np.array([0.0, 0.0, 1.0])
-    x = np.array([np.sin(angle), -np.cos(angle), 0.0])
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    T[:3, 3] = position
-    return T
 
 
 def depth_image(boxes: Float64, T_world_camera: Float64, rng: np.random.Generator) -> UInt16:

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(1, str(Path(__file__).resolve().parents[1] / "test"))
 
 from bench.figures import Figure, Setup
 from bench.homes import Home, home, nodes_of, poses, see
