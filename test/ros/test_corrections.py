@@ -12,6 +12,7 @@ from geometry_msgs.msg import TransformStamped
 
 from deworldsg_ros.graph.provenance import Trail
 from deworldsg_ros.ros import transforms
+from deworldsg_ros.scene.camera import invert_pose, rigid_motion
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import set_stamp
 
@@ -39,13 +40,16 @@ def tf(parent: str, child: str, stamp_ns: int, x: float = 0.0) -> SimpleNamespac
     return SimpleNamespace(transforms=[transform])
 
 
-def walked() -> Trail:
+def walked(T_graph_world: np.ndarray | None = None) -> Trail:
     """A camera that goes 8 m and comes back."""
     trail = Trail()
+    if T_graph_world is None:
+        T_graph_world = np.eye(4)
+    trail.place(T_graph_world)
     for number in range(160):
         T = np.eye(4)
         T[0, 3] = 0.1 * min(number, 160 - number)
-        trail.note(number * S // 10 + S, T, T)
+        trail.note(number * S // 10 + S, T_graph_world @ T, T_graph_world @ T)
     return trail
 
 
@@ -61,6 +65,16 @@ def test_a_jump_of_map_to_odom_is_a_closed_loop(heard) -> None:
     moved = change.T_new_old[:, 0, 3]
     assert moved[-1] == pytest.approx(-0.5, abs=0.02) and abs(moved[1:3]).max() < 0.02
     assert (np.diff(moved[1:]) <= 1e-9).all()
+
+
+def test_a_jump_moves_a_map_in_its_own_frame() -> None:
+    T_map_world = rigid_motion(np.array([3.0, 1.0, 0.0]), np.array([0.0, 0.0, np.pi / 2]))
+    jump = rigid_motion(np.array([-0.5, 0.0, 0.0]), np.zeros(3))
+    plain, placed = (trail.jump(jump, 18 * S) for trail in (walked(), walked(T_map_world)))
+    assert plain is not None and placed is not None
+    there = T_map_world @ plain.T_new_old @ invert_pose(T_map_world)
+    assert abs(plain.T_new_old[-1, 0, 3] + 0.5) < 0.02
+    np.testing.assert_allclose(placed.T_new_old, there, atol=1e-9)
 
 
 def test_a_robot_that_moves_is_no_loop_nor_one_whose_slam_says_more(heard) -> None:
