@@ -15,13 +15,14 @@ from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 
 #     question  = "what changed" [ "since" time ] | "like" text
 #               | [ "how many" | "is" | "what colour" ] pattern
-#     pattern   = [ rank ] thing { [ "and" ] condition }
+#     pattern   = [ ordinal ] [ rank ] thing { [ "and" ] condition }
 #     thing     = [ colour ] ( class | "anything" ) | colour
 #     condition = [ "not" ] predicate thing | "near" point | rank | nearest "to" ( thing | point )
 #               | "within" length [ "of" ( thing | point ) ] | colour
 #     colour    = "black", "white", "grey", "red", …
 #     rank      = "largest", "smallest", "highest", … | nearest
 #     nearest   = "closest" | "nearest" | "farthest"
+#     ordinal   = "first", "second", "third", … of a rank; "from" alone means the closest
 #     point     = "(" x "," y "," z ")"        length = number [ "m" | "cm" ]
 #     time      = number [ "s" ] [ "ago" ]     a stamp in seconds, or seconds before the graph's
 #     stamp
@@ -74,6 +75,8 @@ RANKS = {
     **dict.fromkeys(("farthest", "furthest"), ("distance", True)),
 }
 
+ORDINALS = {"first": 1, "second": 2, "third": 3, "fourth": 4, "fifth": 5, "2nd": 2, "3rd": 3}
+
 Kind = Literal["find", "count", "exists", "holds", "colour"]
 
 _TOKEN = re.compile(r"\([^()]*\)|[^\s,()]+|[()]")
@@ -106,19 +109,21 @@ class Condition:
 
 @dataclass(frozen=True)
 class Rank:
-    """The order of the answers; only the first one is meant.
+    """The order of the answers; only the first one is meant, or a later one.
 
     Attributes:
         word: of `RANKS`.
         thing: what is near; None = the point, or nothing.
         point: what is near.
         colour: of the thing; None = any.
+        place: of the one that is meant, from 1.
     """
 
     word: str
     thing: str | None = None
     point: Point | None = None
     colour: str | None = None
+    place: int = 1
 
 
 @dataclass(frozen=True)
@@ -212,6 +217,7 @@ class _Reader:
         self.names = names
 
     def pattern(self, kind: Kind) -> Pattern:
+        ordinal = self.tokens.pop(0) if self.tokens[:1] and self.tokens[0] in ORDINALS else None
         rank = self.tokens.pop(0) if self.tokens[:1] and self.tokens[0] in RANKS else None
         thing, colour = self.thing()
         ranks = [] if rank is None else [self._rank(rank)]
@@ -221,6 +227,8 @@ class _Reader:
                 self.tokens.pop(0)
             elif self.tokens[0] in RANKS:
                 ranks.append(self._rank(self.tokens.pop(0)))
+            elif ordinal is not None and not ranks and self.tokens[0] in ("from", "to"):
+                ranks.append(self._rank("closest"))
             else:
                 conditions.append(self.condition())
         conditions = list(dict.fromkeys(conditions))  # said twice, it counts once
@@ -234,6 +242,13 @@ class _Reader:
         if len(ranks) > 1:
             words = " and ".join(found.word for found in ranks)
             raise ClientError(f"question '{self.question}': {words}: expected one of them")
+        if ordinal is not None:
+            if not ranks:
+                raise ClientError(
+                    f"question '{self.question}': {ordinal} in which order? expected a word such "
+                    "as largest, or 'from' and a thing or a point"
+                )
+            ranks[0] = replace(ranks[0], place=ORDINALS[ordinal])
         if kind == "holds" and not conditions:
             kind = "exists"
         return Pattern(thing, tuple(conditions), kind, ranks[0] if ranks else None)

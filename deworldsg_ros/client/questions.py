@@ -303,7 +303,7 @@ def _understood(graph: SceneGraph, asked: Pattern) -> tuple[Pattern, list[str]]:
 
 
 def _ranked(graph: SceneGraph, rank: Rank, answers: list[Answer]) -> tuple[list[Answer], list[str]]:
-    """The sure answers by a rank, each with what was compared, the first one first."""
+    """The sure answers by a rank, each with what was compared, the one that is meant first."""
     kind, most_first = RANKS[rank.word]
     near: Point | SceneObject | None = rank.point
     if rank.thing is not None or rank.colour is not None:
@@ -334,7 +334,7 @@ def _ranked(graph: SceneGraph, rank: Rank, answers: list[Answer]) -> tuple[list[
     found = [replace(one, evidence=f"{one.evidence}; {text}") for (_, text), one in compared]
     doubtful = len(answers) - len(known)
     notes = [f"{counted(doubtful, 'doubtful object')} not compared"] if doubtful > 0 else []
-    return found, notes
+    return found[rank.place - 1 :], notes
 
 
 def since_ns(graph: SceneGraph, since: Since) -> int:

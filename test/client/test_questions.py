@@ -45,6 +45,11 @@ ON_RED = Condition("on", "table", colour="red")
         ("closest chair to cup", Pattern("chair", (), "find", Rank("closest", "cup"))),
         ("which chair is closest to cup", Pattern("chair", (), "find", Rank("closest", "cup"))),
         (
+            "the second chair from the cup",
+            Pattern("chair", (), rank=Rank("closest", "cup", place=2)),
+        ),
+        ("third largest chair", Pattern("chair", (), rank=Rank("largest", place=3))),
+        (
             "cup on table nearest to (1, 2, 3)",
             Pattern("cup", (ON_TABLE,), "find", Rank("nearest", None, (1.0, 2.0, 3.0))),
         ),
@@ -94,6 +99,7 @@ def test_patterns(question, meaning):
         ("cup on (1, 2, 3)", "near or within"),
         ("cup and cup", "'cup' is no condition"),
         ("closest cup", "closest to what"),
+        ("second cup on table", "second in which order"),
         ("largest cup nearest to table", "largest and nearest"),
         ("how many", "expected a class"),
         ("what colour is", "expected a class"),
@@ -180,6 +186,18 @@ def test_questions_of_people(room, question, found, said, note):
     assert ids[: len(found)] == found and bool(ids) == bool(found)
     assert (answers.said or "").startswith(said or "") and (answers.said is None) == (said is None)
     assert any(note in one for one in ("", *answers.notes))
+
+
+def test_the_second_of_an_order_is_what_comes_after_the_first(room):
+    for of_all, ordered in (
+        ("chair closest to the fridge", "{} chair from the fridge"),
+        ("largest chair", "{} largest chair"),
+    ):
+        chairs = [answer.item.id for answer in ask(room, of_all).found]
+        assert len(chairs) > 2
+        for place, word in enumerate(("first", "second", "third", "fourth", "fifth")):
+            found = [answer.item.id for answer in ask(room, ordered.format(word)).found]
+            assert found == chairs[place:]
 
 
 @pytest.mark.parametrize(
