@@ -133,7 +133,8 @@ def main() -> None:
     if options.list:
         print("\n".join(ENTRIES))
         return
-    entries = [ENTRIES[name] for name in options.only or ENTRIES]
+    unasked = [name for name, entry in ENTRIES.items() if not entry.only]
+    entries = [ENTRIES[name] for name in options.only or unasked]
     data = options.data.resolve() if options.data.is_dir() else None
     report = run_all(entries, Setup(data, options.quick))
     if options.json is not None:

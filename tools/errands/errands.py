@@ -15,22 +15,24 @@ import sys
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(Path(__file__).resolve().parent)]
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import cv2
 import numpy as np
-from home import CELL_M, RADIUS_M, Home, build
+from home import CELL_M, RADIUS_M, build
 from mind import Mind, OtherMind, Way, by_label, by_question, other_minds, perceiver, way_to
 from robot import CAMERA, Planner, Robot, length_m, looking
 from tasks import Task, absent_tasks, move_things, standing_tasks
 
-from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.grammar import Pattern, parse
+from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
 
+ROOT = Path(__file__).resolve().parents[2]
 # The homes of the reported figures; the constants were chosen on homes 0 to 9.
 FIRST, HOMES = 100, 10
 # An errand is fulfilled if the thing is in view from here, with so many pixels.
@@ -134,10 +136,8 @@ class Referee:
         near = []
         for number in task.right:
             box = self.home.bounds(number)
-            near += [
-                item for item in graph
-                if (np.abs(np.array(item.position_m) - box.mean(0)) < (box[1] - box[0]) / 2 + 0.2).all()
-            ]  # fmt: skip
+            reach = (box[1] - box[0]) / 2 + 0.2
+            near += [i for i in graph if (np.abs(i.position_m - box.mean(0)) < reach).all()]
         if not near:
             return "not in the graph"
         names = [item.label for item in near]
@@ -153,15 +153,18 @@ class Errands:
         seed: of the home.
         kind: of the detections: ``boxes`` or ``embedded``.
         others: whether the graphs to compare with are made, too.
+        colours: whether MuJoCo renders the images; it does for ``embedded``.
     """
 
-    def __init__(self, seed: int, kind: str, *, others: bool = False) -> None:
+    def __init__(
+        self, seed: int, kind: str, *, others: bool = False, colours: bool = False
+    ) -> None:
         self.seed, self.home = seed, build(seed)
         self.kind = kind
         self.rng = np.random.default_rng([seed, 3])
         first = self._spots(0)[0]
         self._view = None
-        if kind == "embedded":
+        if colours or kind == "embedded":
             from mujoco_view import MujocoView
 
             self._view = MujocoView(self.home, CAMERA)
@@ -319,7 +322,12 @@ class Errands:
         return None, True
 
     def _judge(
-        self, task: Task, target: SceneObject | None, reached: bool, start: np.ndarray, path_m: float
+        self,
+        task: Task,
+        target: SceneObject | None,
+        reached: bool,
+        start: np.ndarray,
+        path_m: float,
     ) -> str:
         if not task.right:
             return "" if target is None else "claimed"
@@ -380,58 +388,61 @@ def _gap_m(point: np.ndarray, box: np.ndarray) -> float:
     return float(np.linalg.norm(np.maximum(np.maximum(box[0] - point, point - box[1]), 0.0)))
 
 
-def run_home(job: tuple[int, str, bool, int | None]) -> tuple[list[Outcome], dict[str, float]]:
-    """All errands of a home; how long it took.
+def run_home(
+    seed: int, kind: str, *, others: bool = False, most: int | None = None
+) -> list[Outcome]:
+    """All errands of a home, each told when it is done.
 
     Args:
-        job: seed of the home, kind of the detections, whether others are compared with, and the
-            greatest number of errands.
+        seed: of the home.
+        kind: of the detections.
+        others: whether other methods are compared with.
+        most: greatest number of errands; None = all.
     """
-    seed, kind, others, most = job
     cv2.setNumThreads(1)
     start_s, cpu_s = time.perf_counter(), time.process_time()
     errands = Errands(seed, kind, others=others)
-    rng = errands.rng
     errands.tour()
     errands.on_tour = False
-    tour_frames, tour_m = errands.robot.frames, errands.robot.path_m
+    robot, home = errands.robot, errands.home
     found: list[Outcome] = []
-    first = [*standing_tasks(errands.home, rng), *absent_tasks(errands.home, rng)]
-    for task in first[:most]:
+    tasks = [*standing_tasks(home, errands.rng), *absent_tasks(home, errands.rng)]
+    for task in tasks[:most]:
         if others:
             found += [errands.run_other(method, task) for method in (*errands.others, LABEL)]
         found.append(errands.run(task))
-    if most is None or most > len(first):
-        later = move_things(errands.home, rng)
-        errands.robot.camera.move()
-        for task in later[: None if most is None else most - len(first)]:
+        _tell(found[-1])
+    if most is None or most > len(tasks):
+        moved = move_things(home, errands.rng)
+        robot.camera.move()
+        for task in moved[: None if most is None else most - len(tasks)]:
             found.append(errands.run(task))
+            _tell(found[-1])
     errands.close()
-    return found, {
-        "frames": errands.robot.frames, "tour_frames": tour_frames, "tour_m": tour_m,
-        "path_m": errands.robot.path_m, "bumps": errands.robot.bumps,
-        "nodes": len(errands.mind.graph()), "objects": len(errands.home.present),
-        "seconds": time.perf_counter() - start_s, "cpu_s": time.process_time() - cpu_s,
-    }  # fmt: skip
+    print(
+        f"home {seed} ({kind}): {robot.frames} frames, {robot.path_m:.0f} m, {robot.bumps} bumps, "
+        f"{len(errands.mind.graph())} nodes for {len(home.present)} objects, "
+        f"{time.perf_counter() - start_s:.0f} s, {time.process_time() - cpu_s:.0f} s CPU",
+        flush=True,
+    )
+    return found
+
+
+def _tell(one: Outcome) -> None:
+    print(
+        f"{one.home:4} {one.kind:9} {one.words:28} {one.failure or 'ok':18} {one.path_m:5.1f} m, "
+        f"shortest {one.shortest_m:4.1f} m; {one.said}",
+        flush=True,
+    )
 
 
 def run_all(
     seeds: range, kind: str, jobs: int, *, others: bool = False, most: int | None = None
 ) -> list[Outcome]:
     """The errands in all homes, in several processes."""
-    found: list[Outcome] = []
-    work = [(seed, kind, others, most) for seed in seeds]
+    work = partial(run_home, kind=kind, others=others, most=most)
     with multiprocessing.get_context("spawn").Pool(jobs) as pool:
-        for outcomes, numbers in pool.imap(run_home, work, chunksize=1):
-            found += outcomes
-            told = ", ".join(f"{name} {value:.0f}" for name, value in numbers.items())
-            print(f"home {outcomes[0].home if outcomes else '?'} ({kind}): {told}", flush=True)
-            for one in outcomes:
-                if one.method == US:
-                    mark = one.failure or "ok"
-                    print(f"  {one.kind:9} {one.words:28} {mark:18} {one.path_m:5.1f} m of "
-                          f"{one.shortest_m:4.1f} m; {one.said}", flush=True)  # fmt: skip
-    return found
+        return [one for home in pool.imap(work, seeds, chunksize=1) for one in home]
 
 
 def shares(outcomes: list[Outcome], method: str, *kinds: str) -> tuple[int, int]:

@@ -103,7 +103,8 @@ class Home:
         for number in self.present:
             item = self.items[number - 1]
             if item.kind != "flat":
-                outlines += [r.corners() for r in part_rects(item) if 0.02 < r.high and r.low < ROBOT_M]
+                solid = [r for r in part_rects(item) if r.high > 0.02 and r.low < ROBOT_M]
+                outlines += [rect.corners() for rect in solid]
         for outline in outlines:
             cv2.fillConvexPoly(cells, np.round((outline - corner) / CELL_M).astype(np.int32), 1)
         return cells > 0, corner

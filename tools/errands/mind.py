@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from home import RADIUS_M, ROBOT_M, Home
 from robot import Planner, length_m, plan_pose
 
-from deworldsg_ros.base.files import read_regular
 from deworldsg_ros.client.goals import Goal
 from deworldsg_ros.client.goals import Robot as Footprint
-from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.grammar import Pattern, parse
+from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
 from deworldsg_ros.client.questions import ask
 from deworldsg_ros.config import Config
@@ -125,7 +124,7 @@ class Mind:
         return plan_pose(self.T_graph_map @ T_map_camera)
 
     @property
-    def T_graph_map(self) -> np.ndarray:
+    def T_graph_map(self) -> np.ndarray:  # noqa: N802
         """From the frame of the robot's poses to that of the graph, (4, 4)."""
         assert self.pipeline.builder is not None
         return self.pipeline.builder.T_graph_poses

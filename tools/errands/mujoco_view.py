@@ -73,6 +73,7 @@ class MujocoView:
             mujoco.mjtCatBit.mjCAT_ALL, self._scene,
         )  # fmt: skip
 
+
 def _xml(home: Home, camera: Intrinsics) -> str:
     """The home as a MuJoCo model: a body for each object."""
     degrees = 2 * math.degrees(math.atan(camera.height / 2 / camera.fy))
@@ -96,7 +97,9 @@ def _xml(home: Home, camera: Intrinsics) -> str:
                 mesh = part.mesh
                 points = " ".join(f"{v:.5f}" for v in mesh.vertices.ravel())
                 faces = " ".join(map(str, mesh.faces.ravel()))
-                meshes.append(f'<mesh name="{name}" vertex="{points}" face="{faces}" inertia="shell"/>')
+                meshes.append(
+                    f'<mesh name="{name}" vertex="{points}" face="{faces}" inertia="shell"/>'
+                )
                 geoms.append(f'<geom type="mesh" mesh="{name}" rgba="{_numbers(colour)} 1"/>')
             else:
                 geoms.append(_geom(part.shape, part.size, part.position, part.rotation, colour))
@@ -111,7 +114,7 @@ def _xml(home: Home, camera: Intrinsics) -> str:
         f'<mujoco><statistic extent="{extent}"/><visual><map znear="{NEAR_M / extent}" '
         f'zfar="{FAR_M / extent}"/><global offwidth="{camera.width}" offheight="{camera.height}"/>'
         '<headlight ambient="0.35 0.35 0.35" diffuse="0.3 0.3 0.3"/></visual>'
-        f'<asset>{"".join(meshes)}</asset><worldbody>{lights}'
+        f"<asset>{''.join(meshes)}</asset><worldbody>{lights}"
         f'<camera name="robot" fovy="{degrees}"/>{"".join(bodies)}</worldbody></mujoco>'
     )
 

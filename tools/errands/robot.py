@@ -33,7 +33,11 @@ CORRECTED_EVERY_M, REST_M, REST_RAD = 3.0, 0.02, math.radians(0.4)
 def looking(x: float, y: float, yaw: float) -> np.ndarray:
     """T_world_camera (4, 4) of the robot's camera when the robot is at a pose."""
     ahead = np.array(
-        [math.cos(yaw) * math.cos(TILT_RAD), math.sin(yaw) * math.cos(TILT_RAD), -math.sin(TILT_RAD)]
+        [
+            math.cos(yaw) * math.cos(TILT_RAD),
+            math.sin(yaw) * math.cos(TILT_RAD),
+            -math.sin(TILT_RAD),
+        ]
     )
     right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
     T = np.eye(4)

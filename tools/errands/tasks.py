@@ -106,7 +106,9 @@ def move_things(home: Home, rng: np.random.Generator, count: int = 3) -> list[Ta
         old, rotation, position = home.on.pop(thing), item.rotation, item.position
         places = [int(b) for b in rng.permutation(bearers(home)) if int(b) != old]
         # One of two stays in its room.
-        places.sort(key=lambda b: home.room_of[b] != home.room_of[old], reverse=bool(rng.integers(2)))
+        places.sort(
+            key=lambda b: home.room_of[b] != home.room_of[old], reverse=bool(rng.integers(2))
+        )
         for bearer in places:
             if place_on(home, item, bearer, rng):
                 if np.linalg.norm(home.bounds(thing).mean(0) - before) < 0.6:
