@@ -25,6 +25,9 @@ MAX_DISTANCE_M = 10.0
 MAX_RADIUS_M, MAX_HEIGHT_M = 5.0, 10.0
 # Heights above the floor at which the seen space is looked at; below, the floor itself is seen.
 LOWEST_M, HEIGHT_STEP_M = 0.2, 0.3
+# A line of sight is looked at in such steps, at this share of the robot's height: a wall is thicker
+# than a step, most furniture lower, and a camera that looks down sees walls no higher.
+SIGHT_STEP_M, SIGHT_HEIGHT = 0.05, 0.75
 # Something is at a spot if more than this share of the robot's volume was seen as occupied.
 MAX_OCCUPIED = 0.05
 # The floor is this quantile of the bottoms of all boxes: few objects seem to be below it.
@@ -146,7 +149,8 @@ def goal_near(
     touches no other box that is lower than the robot. Of the free ones, the best sees the side of
     the object whose surface was seen, past no other object that hides it, is between the objects of
     the graph, and is nearest to `towards`. Walls are no objects: they are known only from `space`.
-    Then a direction is not free, either, if the camera has seen something there.
+    Then a direction is not free, either, if the camera has seen something there; and what is behind
+    a wall is taken last.
 
     Args:
         target: to look at.
@@ -173,7 +177,8 @@ def goal_near(
     rays = _rays()
     spots = np.array([_spot(target.footprint, ray, distance) for ray in rays])
     shares = _seen_free(space, target, spots, floor, robot)
-    for ray, spot, seen_free in zip(rays, spots, shares):
+    walls = _walls_between(space, target, spots, floor + SIGHT_HEIGHT * robot.height_m)
+    for ray, spot, seen_free, is_behind in zip(rays, spots, shares, walls):
         clearance = float(point_gaps_m(spot, boxes).min(initial=math.inf)) - robot.radius_m
         if clearance <= 0.0:
             continue
@@ -183,7 +188,7 @@ def goal_near(
         known = area is not None and bool(point_gaps_m(spot, area[None])[0] == 0.0)
         goal = _goal(target, ray, spot, floor, stamp_ns, clearance, blocker, known)
         goal = replace(goal, seen_free=seen_free)
-        score = _score(goal, towards)
+        score = _score(goal, towards) - 5.0 * is_behind
         if best is None or score > best[0] + 1e-9:
             best = (score, goal)
     if best is None:
@@ -254,6 +259,21 @@ def _seen_free(
     volume = np.column_stack([plan, levels]) @ horizontal_axes(target.up)
     free, occupied = (seen.reshape(len(spots), -1).mean(axis=1) for seen in space.look(volume))
     return np.where(occupied > MAX_OCCUPIED, -1.0, free).tolist()
+
+
+def _walls_between(
+    space: SeenSpace | None, target: SceneObject, spots: Float64, level_m: float
+) -> list[bool]:
+    """Whether something was seen between each spot and the target, above what is low there."""
+    if space is None or not len(space):
+        return [False] * len(spots)
+    level, own = max(level_m, target.footprint.high + SIGHT_STEP_M), target.footprint.center
+    count = int(np.linalg.norm(spots - own, axis=1).max() / SIGHT_STEP_M) + 2
+    shares = np.linspace(0.0, 1.0, count)[:, None]
+    lines = (spots[:, None] + shares * (own - spots[:, None])).reshape(-1, 2)
+    points = np.column_stack([lines, np.full(len(lines), level)]) @ horizontal_axes(target.up)
+    occupied = space.look(points)[1].reshape(len(spots), -1)
+    return [bool(count > 1) for count in occupied.sum(axis=1)]
 
 
 def floor_m(items: Sequence[SceneObject]) -> float:

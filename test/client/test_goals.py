@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.spaces import add_view, looking
 from support.view import box_at, make_edge, make_graph, make_node
 
 from deworldsg_ros.client import ClientError, Robot, SceneGraph
 from deworldsg_ros.client.boxes import footprint, gap_m, point_gaps_m, polygon_gap_m
+from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.scene.camera import pose_from_quaternion
 from deworldsg_ros.wire import messages as wire
 
@@ -62,6 +64,25 @@ def test_a_goal_is_at_the_distance_faces_the_object_and_is_free(corner):
     assert goal.bearing_std_rad == pytest.approx(math.atan2(goal.across_std_m, 0.95), abs=0.02)
     near = corner.goal_near("cup", 0.9, towards=(0.2, -8.0, 0.0))
     assert near.position_m[1] < -0.8  # the side of the robot
+
+
+def test_a_goal_is_not_behind_a_wall_that_was_seen():
+    # A thing 0.2 m beside a wall, the robot on the other side of it, and all of both sides seen.
+    wall = ((0.5, -1.5, 0.0), (0.6, 1.5, 2.5))
+    graph = graph_of(
+        boxed(1, "cup", (0.25, 0, 0.8), (0.1, 0.1, 0.1)),
+        *(boxed(2 + i, "chair", (x, 1.2 * y, 0.4), (0.4, 0.4, 0.8))
+          for i, (x, y) in enumerate(((-1.6, 1), (-1.6, -1), (1.7, 1), (1.7, -1)))),
+    )  # fmt: skip
+    space = SeenSpace()
+    for number in range(24):
+        x = -1.0 if number < 12 else 1.4
+        add_view(space, looking((x, 0.0, 1.2), 30.0 * number), 10**9 * (number + 1), wall)
+    robot = Robot(0.2, 1.3)
+    there = (1.8, 0.0, 0.0)
+    assert graph.goal_near(1, 0.7, robot=robot, towards=there).position_m[0] > 0.6
+    goal = graph.goal_near(1, 0.7, robot=robot, towards=there, space=space)
+    assert goal.position_m[0] < 0.3 and goal.seen_free == pytest.approx(1.0, abs=0.2)
 
 
 @pytest.mark.parametrize(
