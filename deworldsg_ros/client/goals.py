@@ -28,6 +28,8 @@ LOWEST_M, HEIGHT_STEP_M = 0.2, 0.3
 # A line of sight is looked at in such steps, at this share of the robot's height: a wall is thicker
 # than a step, most furniture lower, and a camera that looks down sees walls no higher.
 SIGHT_STEP_M, SIGHT_HEIGHT = 0.05, 0.75
+# It passes so far above the target, which would else be seen there itself.
+SIGHT_ABOVE_M = 0.15
 # Something is at a spot if more than this share of the robot's volume was seen as occupied.
 MAX_OCCUPIED = 0.05
 # The floor is this quantile of the bottoms of all boxes: few objects seem to be below it.
@@ -267,7 +269,7 @@ def _walls_between(
     """Whether something was seen between each spot and the target, above what is low there."""
     if space is None or not len(space):
         return [False] * len(spots)
-    level, own = max(level_m, target.footprint.high + SIGHT_STEP_M), target.footprint.center
+    level, own = max(level_m, target.footprint.high + SIGHT_ABOVE_M), target.footprint.center
     count = int(np.linalg.norm(spots - own, axis=1).max() / SIGHT_STEP_M) + 2
     shares = np.linspace(0.0, 1.0, count)[:, None]
     lines = (spots[:, None] + shares * (own - spots[:, None])).reshape(-1, 2)
