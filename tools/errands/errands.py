@@ -31,14 +31,19 @@ from tasks import Task, absent_tasks, move_things, standing_tasks
 from deworldsg_ros.client.grammar import Pattern, parse
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
+from deworldsg_ros.scene.camera import invert_pose
 
 ROOT = Path(__file__).resolve().parents[2]
 # The homes of the reported figures; the constants were chosen on homes 0 to 9.
 FIRST, HOMES = 100, 10
 # An errand is fulfilled if the thing is in view from here, with so many pixels.
 IN_VIEW_M, IN_VIEW_PX = 1.5, 100
+# A node is an object if it is as near to its box, and no object of the same name is nearer.
+SAME_M = 0.4
 # Of the shortest path; a metre and a half more is always allowed.
 MOST_DETOUR, SPARE_M = 2.0, 1.5
+# Something so near is looked at from where the robot is, if it is seen from there.
+NEAR_ENOUGH_M = 1.3
 # Places that the robot goes to in one errand, at most.
 MOST_PLACES = 12
 STAGES = (
@@ -83,15 +88,16 @@ class Referee:
         """A planner that knows where everything is."""
         return Planner(*self.home.room_free(), RADIUS_M)
 
-    def shortest_m(self, start: np.ndarray, task: Task) -> float:
-        """The shortest path to a place from which a right object may be seen, by its old place."""
+    def shortest_m(self, start: np.ndarray, task: Task, chosen: int | None = None) -> float:
+        """The shortest path to a place from which the object may be seen, by its old place."""
         planner = self.planner()
         passed_m = 0.0
         if task.was is not None:
             first = self._nearest(planner, start, np.array([task.was, task.was]))
             if first is not None:
                 passed_m, start = first
-        ends = [self._nearest(planner, start, self.home.bounds(n)) for n in task.right]
+        right = task.right if chosen is None else (chosen,)
+        ends = [self._nearest(planner, start, self.home.bounds(n)) for n in right]
         found = [end[0] for end in ends if end is not None]
         return passed_m + min(found) if found else math.inf
 
@@ -129,7 +135,7 @@ class Referee:
                 return True
         return False
 
-    def why_missed(self, task: Task, graph: SceneGraph) -> str:
+    def why_missed(self, task: Task, graph: SceneGraph, T_graph_map: np.ndarray) -> str:
         """The stage that failed for a thing that is there."""
         asked = parse(task.words)
         assert isinstance(asked, Pattern) and asked.thing is not None
@@ -137,7 +143,8 @@ class Referee:
         for number in task.right:
             box = self.home.bounds(number)
             reach = (box[1] - box[0]) / 2 + 0.2
-            near += [i for i in graph if (np.abs(i.position_m - box.mean(0)) < reach).all()]
+            middle = (T_graph_map @ [*box.mean(0), 1.0])[:3]
+            near += [i for i in graph if (np.abs(i.position_m - middle) < reach).all()]
         if not near:
             return "not in the graph"
         names = [item.label for item in near]
@@ -184,9 +191,10 @@ class Errands:
 
     def _spots(self, room: int) -> list[np.ndarray]:
         """Free places of a room: the freest one, and for a wide room one that is far from it."""
+        planner = self._tour_planner()
         distance, corner = self.home.room_free()
         x0, y0, x1, y1 = self.home.rects[room]
-        rows, columns = np.nonzero(distance > RADIUS_M + 0.1)
+        rows, columns = np.nonzero(planner.free)
         places = corner + CELL_M * (np.stack([columns, rows], axis=1) + 0.5)
         inside = ((places > [x0, y0]) & (places < [x1, y1])).all(axis=1)
         places, clear = places[inside], distance[rows, columns][inside]
@@ -195,12 +203,15 @@ class Errands:
             return [places[np.linalg.norm(places - m, axis=1).argmin()] for m in middles]
         first = places[clear.argmax()]
         far = np.linalg.norm(places - first, axis=1)
-        second = places[(far * (clear > RADIUS_M + 0.12)).argmax()]
-        return [first, second] if np.linalg.norm(second - first) > 1.2 else [first]
+        second = places[far.argmax()]
+        return [first, second] if far.max() > 1.5 else [first]
+
+    def _tour_planner(self) -> Planner:
+        return Planner(*self.home.room_free(), RADIUS_M + 0.08)
 
     def tour(self) -> None:
         """Somebody drives the robot through all rooms; in each it turns round."""
-        planner = self.referee.planner()
+        planner = self._tour_planner()
         for room in range(len(self.home.kinds)):
             for spot in self._spots(room):
                 path = planner.path(self.robot.pose, spot, 0.3)
@@ -262,6 +273,8 @@ class Errands:
 
     def _go(self, target: SceneObject) -> bool:
         """Drive to a pose from which a thing is in view, and look at it; false if there is none."""
+        if self._sees_from_here(target):
+            return True
         for _ in range(3):
             way = self._way(self.mind.graph(), target)
             if way is None:
@@ -271,6 +284,18 @@ class Errands:
                 return True
         return False
 
+    def _sees_from_here(self, target: SceneObject) -> bool:
+        """Whether a near thing is seen when the robot only turns to it."""
+        at = self.mind.believed(self.robot.T_map_camera)
+        way = np.array(target.position_m[:2]) - at[:2]
+        if np.linalg.norm(way) > NEAR_ENOUGH_M:
+            return False
+        since_ns = self.robot.stamp_ns
+        bearing = math.atan2(way[1], way[0])
+        self._look_at(bearing - at[2] + float(self.robot.believed[2]))
+        graph = self.mind.graph()
+        return target.id in graph and graph[target.id].last_seen_ns > since_ns
+
     def run(self, task: Task) -> Outcome:
         """Ask the robot, and judge what it does."""
         start, before_m = self.robot.pose.copy(), self.robot.path_m
@@ -278,11 +303,13 @@ class Errands:
         target, reached = self._fetch(task, stamp_ns)
         path_m = self.robot.path_m - before_m
         said = "not there" if target is None else f"{target.name} at {target.position_m}"
-        failure = self._judge(task, target, reached, start, path_m)
-        return Outcome(
-            US, task.kind, task.words, self.seed, failure, path_m,
-            self.referee.shortest_m(start, task) if task.right else 0.0, said,
-        )  # fmt: skip
+        T = self.mind.T_graph_map
+        chosen = None if target is None else self._right_one(target, task, T)
+        shortest_m = self.referee.shortest_m(start, task, chosen) if task.right else 0.0
+        failure = self._judge(task, target, chosen, reached)
+        if not failure and chosen is not None and _is_long(path_m, shortest_m):
+            failure = "path too long"
+        return Outcome(US, task.kind, task.words, self.seed, failure, path_m, shortest_m, said)
 
     def _fetch(self, task: Task, since_ns: int) -> tuple[SceneObject | None, bool]:
         """The object that the robot stands before at the end, or None if it says: not there.
@@ -322,34 +349,25 @@ class Errands:
         return None, True
 
     def _judge(
-        self,
-        task: Task,
-        target: SceneObject | None,
-        reached: bool,
-        start: np.ndarray,
-        path_m: float,
+        self, task: Task, target: SceneObject | None, chosen: int | None, reached: bool
     ) -> str:
+        """The stage that failed, but for the length of the path."""
         if not task.right:
             return "" if target is None else "claimed"
-        if target is None:
-            return self.referee.why_missed(task, self.mind.graph())
-        if not self._is_right(target, task):
-            return self.referee.why_missed(task, self.mind.graph())
+        if chosen is None:
+            return self.referee.why_missed(task, self.mind.graph(), self.mind.T_graph_map)
         if not reached:
             return "unreachable"
-        if not self.referee.is_in_view(self.robot.pose, task.right):
-            return "not in view"
-        shortest_m = self.referee.shortest_m(start, task)
-        if path_m > max(MOST_DETOUR * shortest_m, shortest_m + SPARE_M):
-            return "path too long"
-        return ""
+        return "" if self.referee.is_in_view(self.robot.pose, (chosen,)) else "not in view"
 
-    def _is_right(self, target: SceneObject, task: Task) -> bool:
-        at = np.array(target.position_m)
-        gaps = [_gap_m(at, self.home.bounds(number)) for number in task.right]
-        # The nearest object of all has to be a right one, and near.
-        everyone = {n: _gap_m(at, self.home.bounds(n)) for n in self.home.alike(task.right)}
-        return min(gaps) < 0.3 and min(everyone, key=lambda n: everyone[n]) in task.right
+    def _right_one(self, target: SceneObject, task: Task, T_graph_map: np.ndarray) -> int | None:
+        """The number of the right object that a node is; None = it is none of them."""
+        at = (invert_pose(T_graph_map) @ [*target.position_m, 1.0])[:3]
+        gaps = {n: _gap_m(at, self.home.bounds(n)) for n in self.home.alike(task.right)}
+        if not gaps:
+            return None
+        nearest = min(gaps, key=lambda n: gaps[n])
+        return nearest if nearest in task.right and gaps[nearest] < SAME_M else None
 
     def run_other(self, method: str, task: Task) -> Outcome:
         """The same errand with another graph or rule: no frames, the pose is reached exactly."""
@@ -363,21 +381,26 @@ class Errands:
         at = self.mind.believed(robot.T_map_camera) if is_ours else robot.believed
         resolve = by_label if is_ours else by_question
         target = resolve(graph, task.words, at)
-        if not task.right or target is None or not self._is_right(target, task):
-            failure = "claimed" if target is not None else ""
-            if task.right:
-                failure = self.referee.why_missed(task, graph)
+        chosen = None if target is None else self._right_one(target, task, T)
+        if chosen is None or target is None:
+            failure = self.referee.why_missed(task, graph, T) if task.right else ""
+            if not task.right and target is not None:
+                failure = "claimed"
             return Outcome(method, task.kind, task.words, self.seed, failure)
         way = way_to(graph, target, robot.planner(), at, robot.believed, T)
         if way is None:
             return Outcome(method, task.kind, task.words, self.seed, "unreachable")
-        shortest_m, path_m = self.referee.shortest_m(start, task), length_m(way.path)
+        shortest_m, path_m = self.referee.shortest_m(start, task, chosen), length_m(way.path)
         failure = ""
-        if not self.referee.is_in_view(way.pose, task.right):
+        if not self.referee.is_in_view(way.pose, (chosen,)):
             failure = "not in view"
-        elif path_m > max(MOST_DETOUR * shortest_m, shortest_m + SPARE_M):
+        elif _is_long(path_m, shortest_m):
             failure = "path too long"
         return Outcome(method, task.kind, task.words, self.seed, failure, path_m, shortest_m)
+
+
+def _is_long(path_m: float, shortest_m: float) -> bool:
+    return path_m > max(MOST_DETOUR * shortest_m, shortest_m + SPARE_M)
 
 
 def _same(a: SceneObject, b: SceneObject) -> bool:
@@ -408,16 +431,16 @@ def run_home(
     found: list[Outcome] = []
     tasks = [*standing_tasks(home, errands.rng), *absent_tasks(home, errands.rng)]
     for task in tasks[:most]:
-        if others:
-            found += [errands.run_other(method, task) for method in (*errands.others, LABEL)]
+        rivals = (*errands.others, LABEL) if others else ()
+        found += [errands.run_other(method, task) for method in rivals]
         found.append(errands.run(task))
-        _tell(found[-1])
+        _tell(found[-1 - len(rivals) :])
     if most is None or most > len(tasks):
         moved = move_things(home, errands.rng)
         robot.camera.move()
         for task in moved[: None if most is None else most - len(tasks)]:
             found.append(errands.run(task))
-            _tell(found[-1])
+            _tell(found[-1:])
     errands.close()
     print(
         f"home {seed} ({kind}): {robot.frames} frames, {robot.path_m:.0f} m, {robot.bumps} bumps, "
@@ -428,12 +451,13 @@ def run_home(
     return found
 
 
-def _tell(one: Outcome) -> None:
-    print(
-        f"{one.home:4} {one.kind:9} {one.words:28} {one.failure or 'ok':18} {one.path_m:5.1f} m, "
-        f"shortest {one.shortest_m:4.1f} m; {one.said}",
-        flush=True,
-    )
+def _tell(outcomes: list[Outcome]) -> None:
+    for one in outcomes:
+        print(
+            f"{one.home:4} {one.method:24} {one.kind:9} {one.words:28} {one.failure or 'ok':18} "
+            f"{one.path_m:5.1f} m, shortest {one.shortest_m:4.1f} m; {one.said}",
+            flush=True,
+        )
 
 
 def run_all(

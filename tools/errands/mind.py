@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from home import RADIUS_M, ROBOT_M, Home
-from robot import Planner, length_m, plan_pose
+from robot import CAMERA_M, TILT_RAD, Planner, length_m, plan_pose
 
 from deworldsg_ros.client.goals import Goal
 from deworldsg_ros.client.goals import Robot as Footprint
@@ -40,10 +41,12 @@ from deworldsg_ros.scene.vocabulary import COCO_CLASSES
 CLASSES = (*COCO_CLASSES, "cabinet", "counter", "desk", "shelf", "stand", "window")
 # Faults of detections: those of the evaluation, and names that are wrong for two seconds on end.
 FRAME_FAULTS = FrameFaults(flip=0.1, miss=0.1, jitter_px=2.0)
-FAULTS = Faults(label=0.1, false=0.5)
-# An answer that is less probable is none.
-LEAST = 0.3
+FAULTS = Faults(label=0.05, false=0.5)
+# An answer that is less probable is none; those that are about as probable as the best are equal.
+LEAST, EQUAL = 0.15, 0.8
 DISTANCES_M = (0.7, 1.0, 1.3)
+# So far below the horizon does the camera see, with a margin.
+SEES_DOWN_RAD = TILT_RAD + math.radians(18)
 
 
 class TrueBoxes:
@@ -167,12 +170,24 @@ Resolve = Callable[[SceneGraph, str, np.ndarray], "SceneObject | None"]
 
 
 def by_question(graph: SceneGraph, words: str, at: np.ndarray) -> SceneObject | None:
-    """The most probable answer to the question; None = there is none that can be believed."""
+    """The best answer to the question, of equal ones the nearest; None = none can be believed."""
     try:
         found = [one for one in ask(graph, words).found if one.probability >= LEAST]
     except ClientError:  # a name that the graph has not
         return None
-    return found[0].item if found else None
+    if not found or _is_ordered(words):
+        return found[0].item if found else None
+    return _nearest([i.item for i in found if i.probability >= EQUAL * found[0].probability], at)
+
+
+def _is_ordered(words: str) -> bool:
+    asked = parse(words)
+    return isinstance(asked, Pattern) and asked.rank is not None
+
+
+def _nearest(items: list[SceneObject], at: np.ndarray) -> SceneObject:
+    gaps = [float(np.linalg.norm(np.array(item.position_m[:2]) - at[:2])) for item in items]
+    return items[int(np.argmin(gaps))]
 
 
 def by_label(graph: SceneGraph, words: str, at: np.ndarray) -> SceneObject | None:
@@ -183,8 +198,7 @@ def by_label(graph: SceneGraph, words: str, at: np.ndarray) -> SceneObject | Non
         items = graph.objects(asked.thing)
     except ClientError:
         return None
-    near = [(float(np.linalg.norm(np.array(item.position_m[:2]) - at[:2])), item) for item in items]
-    return min(near, key=lambda pair: pair[0])[1] if near else None
+    return _nearest(items, at) if items else None
 
 
 @dataclass(frozen=True)
@@ -206,7 +220,8 @@ def way_to(
 ) -> Way | None:
     """The pose of `goal_near` that the planner reaches, of the first distance that has one."""
     footprint = Footprint(RADIUS_M, ROBOT_M)
-    for distance_m in DISTANCES_M:
+    least_m = (CAMERA_M - target.height_m) / math.tan(SEES_DOWN_RAD)
+    for distance_m in [d for d in DISTANCES_M if d >= least_m] or DISTANCES_M[-1:]:
         try:
             goal = graph.goal_near(
                 target, distance_m, robot=footprint, towards=(*at_graph[:2].tolist(), 0.0)

@@ -69,12 +69,14 @@ def main() -> None:
     """Run one errand, and write the picture."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path, nargs="?", default=OUT)
-    parser.add_argument("--home", type=int, default=1)
+    parser.add_argument("--home", type=int, default=4)
     parser.add_argument("--errand", type=int, default=0)
     options = parser.parse_args()
     errands = Errands(options.home, "boxes", colours=True)
+    camera = errands.robot.camera
+    view, camera.view = camera.view, None  # true boxes need no colours; the picture does
     errands.tour()
-    errands.on_tour = False
+    errands.on_tour, camera.view = False, view
     task = standing_tasks(errands.home, errands.rng)[options.errand]
     shots: list[tuple[np.ndarray, list[np.ndarray]]] = []
     trail: list[np.ndarray] = []
@@ -91,7 +93,7 @@ def main() -> None:
     for rgb, plan in [*shots[::EVERY], shots[-1]]:
         view = cv2.resize(rgb, (480, HEIGHT), interpolation=cv2.INTER_AREA)
         cv2.rectangle(view, (0, 0), (480, 26), (30, 30, 34), -1)
-        words = f'"go to the {task.words}"'
+        words = '"go to the ' + task.words.replace(" on ", " on the ") + '"'
         cv2.putText(view, words, (8, 18), FONT, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
         steps.append(Image.fromarray(np.hstack([plan, view])))
     durations = [STEP_MS] * (len(steps) - 1) + [LAST_MS]

@@ -84,7 +84,19 @@ def _fill(triangles, colours, owners, fx, fy, cx, cy, width, height):
     inverse = np.zeros((height, width), np.float32)
     faces = np.full((height, width), -1, np.int32)
     polygon, screen = np.empty((4, 3)), np.empty((4, 3))
+    wide, high = max(cx, width - cx) / fx, max(cy, height - cy) / fy
     for index in range(len(triangles)):
+        # Most triangles are behind the camera or beside the image.
+        behind, left, right, above, below = 0, 0, 0, 0, 0
+        for k in range(3):
+            x, y, z = triangles[index, k, 0], triangles[index, k, 1], triangles[index, k, 2]
+            behind += z < NEAR_M
+            left += x < -wide * z
+            right += x > wide * z
+            above += y < -high * z
+            below += y > high * z
+        if 3 in (behind, left, right, above, below):
+            continue
         count = 0
         for k in range(3):
             a, b = triangles[index, k], triangles[index, (k + 1) % 3]

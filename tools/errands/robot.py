@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mujoco_view import MujocoView
 
 RATE_HZ = 5.0
-SPEED_M_S, TURN_RAD_S = 0.7, math.radians(80)
+SPEED_M_S, TURN_RAD_S = 0.9, math.radians(100)
 CAMERA_M, TILT_RAD = 1.2, math.radians(22)
 CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
 RANGE_M = 5.0
@@ -57,17 +57,19 @@ class Camera:
 
     Args:
         home: what it sees.
+
+    Attributes:
         view: renders the colours; None = plain ones, for true boxes.
     """
 
     def __init__(self, home: Home, view: MujocoView | None = None) -> None:
-        self._triangles, self._view = Triangles(home), view
+        self._triangles, self.view = Triangles(home), view
 
     def move(self) -> None:
         """See all objects where the home has them now."""
         self._triangles.move()
-        if self._view is not None:
-            self._view.move()
+        if self.view is not None:
+            self.view.move()
 
     def instances(self, T_world_camera: np.ndarray) -> np.ndarray:
         """The number of the object that each pixel shows (h, w) uint16; 0 = none."""
@@ -78,8 +80,8 @@ class Camera:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """RGB (h, w, 3) uint8, noisy depth (h, w) float32 in metres, and the true objects."""
         rgb, depth, instances = self._triangles.render(T_world_camera, CAMERA)
-        if self._view is not None:
-            rgb = self._view.render(T_world_camera)
+        if self.view is not None:
+            rgb = self.view.render(T_world_camera)
         noise = rng.standard_normal(depth.shape, np.float32)
         depth = depth + (0.0012 + 0.0019 * (depth - 0.4) ** 2) * noise
         bend = np.abs(cv2.Laplacian(depth, cv2.CV_32F)) > np.maximum(0.05, 0.03 * depth)
@@ -143,7 +145,9 @@ class Grid:
         inside = (rows >= 0) & (columns >= 0) & (rows < len(hit)) & (columns < hit.shape[1])
         hit[rows[inside], columns[inside]] = 1
         free = np.zeros(self.hits.shape, np.uint8)
-        for fan in fans(T_map_camera[:3, 3], rays, small.astype(np.float64), (0.05, ROBOT_M)):
+        # Every second row of rays leaves no gap.
+        rays, ends = rays[::2], small[::2].astype(np.float64)
+        for fan in fans(T_map_camera[:3, 3], rays, ends, (0.05, ROBOT_M)):
             cv2.fillPoly(free, [np.floor((fan - self.corner) / CELL_M).astype(np.int32)], 1)
         self.hits += hit
         # What is seen through at one height may be occupied at another one.
@@ -163,7 +167,11 @@ class Planner:
     """Shortest paths of a disc on a grid of clearances (Dijkstra; the same lengths as A*)."""
 
     def __init__(self, clearance_m: np.ndarray, corner: np.ndarray, radius_m: float) -> None:
-        self.corner, self.free = corner, clearance_m > radius_m
+        # Pockets that are cut off, such as between chairs, are no places to be or to go to.
+        _, parts = cv2.connectedComponents((clearance_m > radius_m).astype(np.uint8))
+        sizes = np.bincount(parts.ravel())
+        sizes[0] = 0
+        self.corner, self.free = corner, (parts == sizes.argmax()) & (parts > 0)
         # A little farther from walls where that costs little.
         self._cost = 1.0 + 0.6 * np.clip((radius_m + 0.2 - clearance_m) / 0.2, 0.0, 1.0)
         self._numbers = np.arange(self.free.size).reshape(self.free.shape)
@@ -284,9 +292,14 @@ class Robot:
         """x, y and yaw (3,) where it believes to be."""
         return plan_pose(self.T_map_camera)
 
-    def planner(self, radius_m: float = RADIUS_M + 0.03) -> Planner:
-        """A planner on the grid as it is now."""
-        return Planner(self.grid.clearance(), self.grid.corner, radius_m)
+    def planner(self) -> Planner:
+        """A planner on the grid as it is now; a bolder one if the robot is close to something."""
+        clearance_m = self.grid.clearance()
+        for spare_m in (0.03, -0.03, -0.08):
+            planner = Planner(clearance_m, self.grid.corner, RADIUS_M + spare_m)
+            if planner.near(self.believed, 0.3) is not None:
+                break
+        return planner
 
     def step(self, target: np.ndarray) -> bool:
         """Drive towards a point (2,) for the time of a frame; false if something is in the way."""

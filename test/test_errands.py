@@ -1,0 +1,110 @@
+"""tools/errands: a robot that acts on the graph in a simulated home."""
+
+import importlib
+import sys
+
+import numpy as np
+import pytest
+
+from deworldsg_ros.scene.camera import Intrinsics
+
+
+@pytest.fixture(scope="module")
+def tool(root_dir):
+    """Imports a module of the tool."""
+    folder = str(root_dir / "tools" / "errands")
+    sys.path.insert(0, folder)
+    yield importlib.import_module
+    sys.path.remove(folder)
+
+
+def test_homes_have_rooms_and_things_and_the_errands_are_true(tool):
+    home = tool("home").build(3)
+    tasks = tool("tasks")
+    rng = np.random.default_rng(0)
+    assert 4 <= len(home.kinds) <= 6
+    assert [item.number for item in home.items] == list(range(1, len(home.items) + 1))
+    for thing, bearer in home.on.items():
+        (low, _), (_, top) = home.bounds(thing)[:, 2], home.bounds(bearer)[:, 2]
+        assert low <= top + 0.01
+    asked = [*tasks.standing_tasks(home, rng), *tasks.absent_tasks(home, rng)]
+    for task in asked:
+        if task.kind == "relation":
+            thing, bearer = task.words.split(" on ")
+            expected = [
+                a for a, b in home.on.items() if (home.name(a), home.name(b)) == (thing, bearer)
+            ]
+            assert sorted(task.right) == sorted(expected)
+        elif task.kind == "absent":
+            assert not task.right
+            assert " on " in task.words or not home.called(task.words)
+    before = {number: home.bounds(number) for number in home.present}
+    moved = tasks.move_things(home, rng)
+    assert {task.kind for task in moved} <= {"moved", "removed"} and moved
+    for task in moved:
+        if task.kind == "moved":
+            (number,) = task.right
+            assert np.abs(home.bounds(number) - before[number]).max() > 0.3
+        else:
+            assert not task.right and not home.called(task.words)
+
+
+def test_depth_and_objects_are_those_of_rays(tool):
+    home = tool("home").build(3)
+    camera = Intrinsics(13.0, 13.0, 7.5, 5.5, 16, 12)
+    boxed = next(i for i in home.items if home.name(i.number) == "refrigerator")
+    low, high = home.bounds(boxed.number)
+    # From before it.
+    eye = boxed.position + boxed.rotation @ [0.0, -1.5, 1.2]
+    ahead = (low + high) / 2 - eye
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    T[:3, 3] = eye
+    triangles = tool("raster").Triangles(home)
+    _, depth_m, owners = triangles.render(T, camera)
+    v, u = np.mgrid[:12, :16]
+    rays = camera.back_project(u, v, np.ones((12, 16))) @ T[:3, :3].T
+    best, owner = np.full((12, 16), np.inf), np.full((12, 16), -1)
+    for corners, number in zip(triangles.corners, triangles.owners):
+        a, b, c = corners - eye
+        with np.errstate(divide="ignore", invalid="ignore"):
+            normal = np.cross(b - a, c - a)
+            t = (a @ normal) / (rays @ normal)
+            p = rays * t[..., None]
+            sides = [np.cross(q - o, p - o) @ normal for o, q in ((a, b), (b, c), (c, a))]
+        hit = (np.stack(sides) >= 0).all(axis=0) & (t > 0.05) & (t < best)
+        best[hit], owner[hit] = t[hit], number
+    same = np.abs(depth_m - np.where(np.isfinite(best), best, 0.0)) < 1e-3
+    # At edges, a pixel may belong to either side.
+    assert same.mean() > 0.98
+    assert (owners == np.maximum(owner, 0))[same].mean() > 0.99
+    assert (owners == boxed.number).any()
+
+
+def test_the_planner_finds_the_shortest_way_round_a_wall(tool):
+    robot = tool("robot")
+    free = np.ones((60, 80), bool)
+    free[:40, 40:44] = False
+    import cv2
+
+    clearance = 0.05 * cv2.distanceTransform(free.astype(np.uint8), cv2.DIST_L2, 5)
+    planner = robot.Planner(clearance, np.zeros(2), 0.2)
+    path = planner.path(np.array([1.0, 0.5]), np.array([3.2, 0.5]))
+    # Round the corner of the wall at (2.0 to 2.2, 2.0), 0.2 m away from it.
+    least = np.hypot(0.9, 1.6) + np.hypot(0.9, 1.6)
+    assert least < robot.length_m(path) < 1.25 * (least + 0.4)
+    rows, columns = np.floor(path[:, ::-1] / 0.05).astype(int).T
+    assert (clearance[rows, columns] > 0.2).all()
+    assert planner.path(np.array([1.0, 0.5]), np.array([2.1, 0.5])) is None
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(240)
+def test_a_robot_fulfils_five_errands(tool):
+    outcomes = tool("errands").run_home(4, "boxes", most=5)
+    assert len(outcomes) == 5
+    assert sum(not one.failure for one in outcomes) >= 4, outcomes
+    assert all(one.path_m > 0 for one in outcomes if not one.failure)
