@@ -102,9 +102,10 @@ def test_the_planner_finds_the_shortest_way_round_a_wall(tool):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(240)
-def test_a_robot_fulfils_five_errands(tool):
-    outcomes = tool("errands").run_home(4, "boxes", most=5)
+@pytest.mark.timeout(400)
+def test_a_robot_fulfils_errands_on_its_graph(tool):
+    outcomes = tool("errands").run_home(8, "boxes", most=5)
     assert len(outcomes) == 5
-    assert sum(not one.failure for one in outcomes) >= 4, outcomes
-    assert all(one.path_m > 0 for one in outcomes if not one.failure)
+    assert sum(not one.failure for one in outcomes) >= 3, outcomes
+    assert all(one.path_m < 2 * one.shortest_m + 1.5 for one in outcomes if not one.failure)
+    assert any(one.path_m > 3.0 for one in outcomes if not one.failure)
