@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "physics_rooms"))
 
 from physics_room import furniture, things
 from physics_room.labels import coco
-from physics_room.layout import WALLS, attach
+from physics_room.layout import WALLS
 from physics_room.plane import Rect, part_rects, rect_of, rects_clash, yaw_of
 from physics_room.shapes import Item, turn
 
@@ -53,6 +53,8 @@ class Home:
         items: furniture and things; `number` is the row plus one.
         on: number of what bears a thing, by its number.
         room_of: row of the room, by number.
+        doors: openings in the walls of the corridor.
+        gone: numbers of what was taken away.
     """
 
     kinds: list[str] = field(default_factory=list)
@@ -354,6 +356,3 @@ def _is_usable(home: Home) -> bool:
             return False
         found.add(int(np.bincount(part[part > 0]).argmax()))
     return len(found) == 1 and len(home.called("chair")) >= 2 and len(home.on) >= 8
-
-
-__all__ = ["Home", "attach", "bearers", "build", "place_on"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from home import RADIUS_M, ROBOT_M, Home
-from robot import CAMERA_M, TILT_RAD, Planner, length_m, plan_pose
+from robot import CAMERA_M, TILT_RAD, Planner, plan_pose
 
 from deworldsg_ros.client.goals import Goal
 from deworldsg_ros.client.goals import Robot as Footprint
@@ -236,6 +236,3 @@ def way_to(
         if path is not None:
             return Way(goal, np.array([*place, np.arctan2(ahead[1], ahead[0])]), path)
     return None
-
-
-__all__ = ["Mind", "OtherMind", "Way", "by_label", "by_question", "length_m", "way_to"]

@@ -88,7 +88,7 @@ def move_things(home: Home, rng: np.random.Generator, count: int = 3) -> list[Ta
     """Move things elsewhere and take one away; returns the errands to them."""
     tasks: list[Task] = []
     single = [n for n in home.on if home.name(n) in {*MANY, *ONCE}]
-    # Named alone, it has to be the only one of its name; with more, all but one are taken away.
+    # Named alone, it has to be the only one of its name.
     names = [str(n) for n in rng.permutation(sorted({home.name(n) for n in single}))]
     for name in names:
         if len(tasks) == count + 1:
