@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -42,12 +40,14 @@ from deworldsg_ros.client.objects import (
     Room,
     Rooms,
     SceneObject,
+    cheapest_chain,
     hidden_object,
     predicate_names,
     relation_of,
     scene_object,
     to_networkx,
 )
+from deworldsg_ros.client.removal import Order, Removal, Removals, resting_on
 from deworldsg_ros.client.text_tower import embed_text
 from deworldsg_ros.graph.embeddings import Looks, embeddings_path, read_embeddings
 from deworldsg_ros.graph.extent import DEFAULT_UP
@@ -137,38 +137,6 @@ def _radius_m(node: wire.NodeState) -> float:
     a, b, c = node.box.size_m
     # A little more, for the rounding of the exact distance.
     return 0.5 * (a * a + b * b + c * c) ** 0.5 + 1e-6
-
-
-# --- The most probable chain of relations between two objects.
-
-
-def cheapest_chain(
-    edges: Mapping[tuple[int, int], wire.EdgeState], first: int, last: int
-) -> list[wire.EdgeState]:
-    """The edges of the chain with the largest product of probabilities; [] if there is none.
-
-    Edges are used in both directions.
-    """
-    links: dict[int, list[tuple[float, int, wire.EdgeState]]] = {}
-    for (a, b), edge in edges.items():
-        # Of two equal chains, the shorter one.
-        cost = 1e-6 - math.log(min(max(edge.probability, 1e-9), 1.0))
-        links.setdefault(a, []).append((cost, b, edge))
-        links.setdefault(b, []).append((cost, a, edge))
-    costs = {first: 0.0}
-    came: dict[int, tuple[int, wire.EdgeState]] = {}
-    waiting = [(0.0, first)]
-    while waiting:
-        cost, node = heapq.heappop(waiting)
-        for step, other, edge in links.get(node, ()):
-            if cost + step < costs.get(other, math.inf):
-                costs[other], came[other] = cost + step, (node, edge)
-                heapq.heappush(waiting, (cost + step, other))
-    chain: list[wire.EdgeState] = []
-    while last != first and last in came:
-        last, edge = came[last]
-        chain.insert(0, edge)
-    return chain
 
 
 # --- A scene graph to ask: from a file, or as a client copied it from the topics.
@@ -499,6 +467,30 @@ class SceneGraph:
         """
         chain = cheapest_chain(self._edges, self.one(start).id, self.one(end).id)
         return [relation_of(edge, self[edge.subject], self[edge.object], None) for edge in chain]
+
+    def resting_on(self, support: Which) -> list[tuple[SceneObject, float]]:
+        """What rests on an object, all the way up, with probabilities; see `removal`."""
+        return resting_on(self, self.one(support))
+
+    def if_removed(self, which: Which) -> Removal:
+        """What moves if an object is taken away, with probabilities.
+
+        Raises:
+            ClientError: without the package mujoco (the extra ``physics``).
+        """
+        return self._removals.without(self.one(which))
+
+    def order_to_take(self, which: Which) -> Order:
+        """What to take first, so that nothing falls when an object is taken; see `if_removed`."""
+        return self._removals.order(self.one(which))
+
+    def order_to_clear(self, support: Which) -> Order:
+        """In which order to take all that rests on an object, so that nothing falls."""
+        return self._removals.clearing(self.one(support))
+
+    @cached_property
+    def _removals(self) -> Removals:
+        return Removals(self)
 
     def free_direction(self, of: Which, towards: Point | None = None, room: float = 1.0) -> Point:
         """A horizontal direction in which an object has room; see `goals.free_direction`."""
