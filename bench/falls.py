@@ -69,7 +69,8 @@ class Scene:
         for gone in (frozenset(taken), frozenset({*taken, number})):
             if gone not in self._moved:
                 self._moved[gone] = self.world.moved(set(gone))
-        return self._moved[frozenset({*taken, number})] - self._moved[frozenset(taken)] - taken
+        moved = self._moved[frozenset({*taken, number})] - self._moved[frozenset(taken)]
+        return moved - taken - {number}
 
     @property
     def by_number(self) -> dict[int, Any]:

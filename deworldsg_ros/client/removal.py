@@ -14,19 +14,43 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from deworldsg_ros.client.boxes import Footprint, gap_m, horizontal_gap_m
-from deworldsg_ros.client.objects import SceneObject, predicate_names
+from deworldsg_ros.client.objects import Point, Relation, SceneObject, predicate_names
 from deworldsg_ros.graph.extent import horizontal_axes
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.scene.vocabulary import plain
 
-if TYPE_CHECKING:
-    from deworldsg_ros.client.graph import SceneGraph
+
+class SceneGraph(Protocol):
+    """What is asked of a `graph.SceneGraph`, which imports this file."""
+
+    up: Point
+
+    def __getitem__(self, node_id: int, /) -> SceneObject: ...
+
+    def edge(self, subject_id: int, object_id: int) -> object:
+        """The edge; None = there is none."""
+
+    def objects(
+        self, *, near: Point | SceneObject | None = None, within: float | None = None
+    ) -> list[SceneObject]:
+        """Objects, the nearest first."""
+        ...
+
+    def relations(
+        self,
+        subject: SceneObject | None = None,
+        predicate: str | None = None,
+        object: SceneObject | None = None,
+    ) -> list[Relation]:
+        """Relations, the most probable first."""
+        ...
+
 
 # --- What rests on what: the supports that a graph believes in.
 
@@ -363,10 +387,12 @@ MOVED_M, DROPPED_M, WATCHED_S = 0.03, 0.004, 0.6
 STEP_S = 0.004
 # kg/m³ and its spread, as a factor: things of a household, hollow or not.
 DENSITY, DENSITY_SPREAD = 250.0, 0.5
+# The centre of mass is off the middle of the box by its error, or by this part of its half side.
+OFF_CENTER = 0.2
 BOARD_M = 0.01
-# Samples of an answer: so many that rest as they were seen, of so many that are drawn; with fewer
-# than the last number, those that do not rest count as well.
-SAMPLES, MOST_DRAWN, FEWEST = 24, 48, 4
+# Samples of a group: as many as this for each object in it, within these limits. Twice as many are
+# drawn to find those that rest as they were seen; with fewer than FEWEST, the others count as well.
+SAMPLES, LEAST_SAMPLES, MOST_SAMPLES, FEWEST = 120, 8, 24, 4
 _OPTION = (
     f'<compiler angle="radian"/><option timestep="{STEP_S}" integrator="implicitfast" '
     'cone="elliptic" impratio="3" iterations="30"/><default><geom contype="0" conaffinity="0"/>'
@@ -492,7 +518,9 @@ class Scene:
             x, y, z = center - origin
             low, high = self._rng.normal(0.0, std_m, (2, 2))
             wide = np.maximum(half[:2] + (high - low) / 2, 0.005)
-            shift, off = (high + low) / 2, self._rng.normal(0.0, std_m, 2)
+            # What is thin stands all the same: the centre of mass is off by a part of the box.
+            off = self._rng.normal(0.0, np.minimum(std_m, OFF_CENTER * half[:2]))
+            shift = (high + low) / 2
             mass = DENSITY * 8.0 * half.prod() * math.exp(DENSITY_SPREAD * self._rng.normal())
             a, b, c = mass / 3.0 * (half**2).sum() - mass / 3.0 * half**2
             boards = "".join(
@@ -599,8 +627,8 @@ class Removals:
         key = tuple(sorted(group))
         if key not in self._scenes:
             rng = np.random.default_rng([len(key), *key])
-            drawn = (Scene(self._contacts, list(key), rng) for _ in range(MOST_DRAWN))
-            settled = list(itertools.islice((one for one in drawn if one.is_settled), SAMPLES))
-            more = [Scene(self._contacts, list(key), rng) for _ in range(SAMPLES)]
-            self._scenes[key] = settled if len(settled) >= FEWEST else more
+            count = min(max(SAMPLES // len(key), LEAST_SAMPLES), MOST_SAMPLES)
+            drawn = [Scene(self._contacts, list(key), rng) for _ in range(2 * count)]
+            settled = list(itertools.islice((one for one in drawn if one.is_settled), count))
+            self._scenes[key] = settled if len(settled) >= FEWEST else drawn[:count]
         return self._scenes[key]
