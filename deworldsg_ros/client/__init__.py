@@ -12,6 +12,7 @@ from deworldsg_ros.client.explain import Explanation
 from deworldsg_ros.client.goals import Goal, Robot
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import HiddenObject, Relation, Room, Rooms, SceneObject
+from deworldsg_ros.client.removal import Order, Removal
 from deworldsg_ros.scene.errors import ClientError
 
 if TYPE_CHECKING:
@@ -23,8 +24,10 @@ __all__ = [
     "Explanation",
     "Goal",
     "HiddenObject",
+    "Order",
     "Pairing",
     "Relation",
+    "Removal",
     "Robot",
     "Room",
     "Rooms",
