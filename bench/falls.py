@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """What falls if something is taken: `SceneGraph.if_removed` against simulated rooms and piles.
 
-python bench/falls.py [--rooms 6] [--piles 40] [--seed 37]
+python bench/falls.py [--rooms 3] [--piles 12] [--seed 37]
 
 The rooms are those of tools/physics_rooms (synthetic), without pictures; the truth is what their
 simulator moves when it takes an object out. The graph has the true boxes and the true supports, or
@@ -308,7 +308,7 @@ def figures(setup: Setup) -> list[Figure]:
     except ImportError as error:
         raise MissingError("no package mujoco (extra physics)") from error
     found = []
-    for kind, count in (("rooms", 1 if setup.quick else 4), ("piles", 4 if setup.quick else 30)):
+    for kind, count in (("rooms", 1 if setup.quick else 3), ("piles", 3 if setup.quick else 12)):
         score = measure(kind, SEED, count)
         precision, recall, error = score.rates(score.said)
         _, alone, _ = score.rates(score.symbolic)
@@ -327,8 +327,8 @@ def figures(setup: Setup) -> list[Figure]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rooms", type=int, default=6)
-    parser.add_argument("--piles", type=int, default=40)
+    parser.add_argument("--rooms", type=int, default=3)
+    parser.add_argument("--piles", type=int, default=12)
     parser.add_argument("--seed", type=int, default=SEED)
     options = parser.parse_args()
     for kind, count in (("rooms", options.rooms), ("piles", options.piles)):

@@ -185,13 +185,14 @@ def test_without_mujoco_the_error_says_what_to_install(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)
 def test_piles_of_the_simulator_fall_as_it_says():
     """Planks on two blocks, with weights: the supports alone find half of what falls."""
     pytest.importorskip("mujoco")
     from bench.falls import measure
 
-    score = measure("piles", 36, 5)
+    score = measure("piles", 36, 3)
     precision, recall, _ = score.rates(score.said)
     _, recall_of_supports, _ = score.rates(score.symbolic)
     assert precision >= 0.9 and recall >= 0.9 > recall_of_supports
-    assert score.steps > 20 and score.false_safe == 0
+    assert score.steps > 10 and score.false_safe == 0
