@@ -317,7 +317,7 @@ def next_view(
     cells = SeenCells(graph.up) if cells is None else cells
     if graph.space is not None:
         cells.add(graph.space)
-    has_views = len(cells.poses) > 0
+    has_views = cells.hits.size > 0
     if not has_views:
         cells = cells_of_rooms(graph)
     items = items_of(graph, cells.axes)
@@ -325,11 +325,14 @@ def next_view(
     here = cells.poses[-1, :3, 3] if start is None and has_views else start
     state, floor = cells.state, cells.floor_m
     origin = None if here is None else (cells.axes @ here)[:2]
-    if origin is not None:
+    if here is not None and origin is not None:
         low = CELL_M * cells.first[:2]
         beside = np.maximum(low - origin, origin - low - CELL_M * np.array(state.shape[:2])).max()
         if beside > MOST_BESIDE_M:
-            raise ClientError(f"start {start} is {beside:.1f} m beside what is known of the space")
+            raise ClientError(
+                f"the robot, at {[round(float(value), 1) for value in here]}, is {beside:.1f} m "
+                "beside what is known of the space"
+            )
     reached = reach(cells, state, robot.radius_m, robot.height_m, origin)
     looks = Looks(cells, state, camera, floor)
     items.sides = (
@@ -533,5 +536,5 @@ def cells_of_rooms(graph: Asked) -> SeenCells:
     boxes = [(item.footprint.corners, item.footprint.low, item.footprint.high) for item in objects]
     cells = enclosed(graph.up, areas, floor, boxes)
     if cells is None:
-        raise ClientError("the rooms are too large: expected less than 120 m by 120 m")
+        raise ClientError("the rooms are too large: expected less than 100 m by 100 m")
     return cells

@@ -21,9 +21,10 @@ from deworldsg_ros.scene.errors import ClientError
 CELL_M = 0.125
 # Farther away, a view tells nothing of small things, and depth cameras little.
 RANGE_M = 6.0
-# Cells from so far below the first camera to so far above it; another storey begins anew.
+# Cells from so far below the first camera to so far above it. Of a camera that is higher or
+# lower by more, it is another storey.
 BELOW_M, ABOVE_M, STOREY_M = 2.6, 1.0, 1.2
-MOST_CELLS = 40_000_000  # a place of 120 m by 120 m
+MOST_CELLS = 20_000_000  # a place of 100 m by 100 m, 60 MB
 # A view tells all of what is so near; of what is farther, less, by the square of the distance.
 CLEAR_M = 2.5
 UNSEEN, FREE, OCCUPIED = 0, 1, 2
@@ -74,19 +75,24 @@ class SeenCells:
         return float(np.dot(self.axes[2], up)) > MOST_TILT * float(np.linalg.norm(up))
 
     def add(self, space: SeenSpace) -> SeenCells:
-        """Take in the views that are new; all views anew if the poses of known ones have moved."""
-        if any(
+        """Take in the views that are new and of the storey of the newest.
+
+        All are taken in anew if the poses of known ones have moved, or the storey is another one.
+        """
+        if not len(space):
+            return self
+        stamps_ns = space.stamps_ns.tolist()
+        levels_m = space.poses[:, :3, 3] @ self.axes[2]
+        if (self.hits.size and abs(levels_m[-1] - self._level_m) > STOREY_M) or any(
             stamp in self._known and not np.array_equal(self._known[stamp], pose)
-            for stamp, pose in zip(space.stamps_ns.tolist(), space.poses)
+            for stamp, pose in zip(stamps_ns, space.poses)
         ):
             self._begin()
-        new = [
-            row for row, stamp in enumerate(space.stamps_ns.tolist()) if stamp not in self._known
-        ]
+        new = [row for row, stamp in enumerate(stamps_ns) if stamp not in self._known]
+        self._known.update({stamps_ns[row]: space.poses[row] for row in new})
+        new = [row for row in new if abs(levels_m[row] - levels_m[-1]) <= STOREY_M]
         for row in new:
-            pose = space.poses[row]
-            self._add(space.depths_mm[row], space.cameras[row], pose)
-            self._known[int(space.stamps_ns[row])] = pose
+            self._add(space.depths_mm[row], space.cameras[row], space.poses[row])
         if new:
             self.poses = np.concatenate([self.poses, space.poses[new]])
             self.cameras = np.concatenate([self.cameras, space.cameras[new]])
@@ -101,8 +107,6 @@ class SeenCells:
         points = turn.astype(np.float32) @ rays * depth[shows] + start.astype(np.float32)[:, None]
         if not points.size:
             return
-        if len(self.hits) and abs(start[2] - self._level_m) > STOREY_M:
-            self._begin()
         low = np.minimum(points.min(axis=1), start)
         high = np.maximum(points.max(axis=1), start)
         if not self._grow(low, high, float(start[2])):
@@ -247,7 +251,7 @@ def reach(
     from scipy.sparse.csgraph import dijkstra
 
     floor = cells.floor_m
-    band = state[:, :, cells.layers(floor + FLOOR_M, floor + height_m)]
+    band = state[:, :, cells.layers(floor + FLOOR_M, floor + max(height_m, 3 * CELL_M))]
     free = (band == FREE).any(axis=2) & ~(band == OCCUPIED).any(axis=2)
     apart = np.full(free.shape, np.inf)
     if start is not None:

@@ -250,11 +250,22 @@ def test_the_cells_remember_forgotten_views_and_follow_moved_ones():
     later.poses[0, 0, 3] += 0.5
     assert len(cells.add(later).poses) == 1
     assert cells.floor_m == pytest.approx(0.0, abs=0.03)
+    # Upstairs, what is below is no floor of the robot's.
+    upstairs = np.eye(4)
+    upstairs[2, 3] = 2.9
+    for number in range(2):
+        add_view(later, looking((-0.5, 0.0, 1.2), 90.0 * number), 2 * 10**12 + number)
+        later.poses[-1] = upstairs @ later.poses[-1]
+        assert len(cells.add(later).poses) == 1 + number
+    assert cells.floor_m == pytest.approx(2.9, abs=0.03)
 
 
 def test_what_cannot_be_answered_says_why():
-    with pytest.raises(ClientError, match="nothing is known of the space"):
-        seen_graph().next_view()
+    dark = half_seen()
+    dark.depths_mm = np.zeros_like(dark.depths_mm)
+    for space in (None, dark):
+        with pytest.raises(ClientError, match="nothing is known of the space"):
+            seen_graph(space=space).next_view()
     graph = seen_graph(space=seen_room())
     with pytest.raises(ClientError, match="three finite numbers"):
         graph.next_view(start=(0.0, math.nan, 0.0))
