@@ -14,7 +14,8 @@ which a method is asked again. Only the choice of the next pose differs:
 
 An object is found if a confirmed node has its name, and the mean of its surface is in its box or
 5 cm beside it. Poses are exact, and the correction of drift is off. Turning is no path. The paths
-are compared to 90 % of the objects; if a method ends before, to what the worse of both has found.
+are compared to 90 % of the objects; if a method ends before, or has driven 60 m, to what the worse
+of both has found.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ CAMERA_M, DOWN_RAD, FAR_M = 1.2, 0.3, 4.5
 # A frame after so much way, or turn.
 STEP_M, TURN_RAD = 0.3, math.radians(22.5)
 # A method is asked again after so much way, or where it wanted to be.
-AGAIN_M, MOST_M = 1.5, 200.0
+AGAIN_M, MOST_M = 1.5, 60.0
 # As `evaluation.graph_measures`: the mean of a node is in the box of an object of its name.
 MARGIN_M, WANTED = 0.05, 0.9
 # Frontiers with fewer cells are too small for a robot.

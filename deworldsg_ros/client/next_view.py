@@ -190,7 +190,7 @@ def items_of(graph: Asked, axes: Float64) -> Items:
         names=np.array([name_nats(item) for item in objects] + [0.0] * len(hidden)),
         exists=np.array([binary_nats(p) for p in existence + [item.existence for item in hidden]]),
         words=[_doubt(item) for item in objects]
-        + [f"whether there is a {i.label}" for i in hidden],
+        + [f"whether there is {_a(i.label)}" for i in hidden],
         edges=np.array([(rows[e.subject], rows[e.object]) for e in edges], np.int64).reshape(-1, 2),
         doubts=np.array([binary_nats(edge.probability) for edge in edges]),
         questions=[
@@ -203,7 +203,11 @@ def items_of(graph: Asked, axes: Float64) -> Items:
 
 def _doubt(item: SceneObject) -> str:
     others = [belief.label for belief in item.classes if belief.label != item.label]
-    return f"{item.name} may be a {others[0]}" if others else f"what {item.name} is"
+    return f"{item.name} may be {_a(others[0])}" if others else f"what {item.name} is"
+
+
+def _a(label: str) -> str:
+    return f"{'an' if label[:1] in 'aeiou' else 'a'} {label}"
 
 
 def sides_seen(items: Items, cells: SeenCells, looks: Looks) -> Float64:
