@@ -33,6 +33,7 @@ from deworldsg_ros.client.meanings import (
     near_names,
     words_of,
 )
+from deworldsg_ros.client.next_view import NextView, next_view
 from deworldsg_ros.client.objects import (
     HiddenObject,
     Point,
@@ -43,19 +44,20 @@ from deworldsg_ros.client.objects import (
     cheapest_chain,
     hidden_object,
     predicate_names,
+    radius_of,
     relation_of,
     scene_object,
     to_networkx,
 )
 from deworldsg_ros.client.removal import Order, Removal, Removals, resting_on
-from deworldsg_ros.client.text_tower import embed_text
-from deworldsg_ros.graph.embeddings import Looks, embeddings_path, read_embeddings
+from deworldsg_ros.graph.embeddings import Looks, embed_text, embeddings_path, read_embeddings
 from deworldsg_ros.graph.extent import DEFAULT_UP
 from deworldsg_ros.graph.floor_plan import CELL_M as PLAN_CELL_M
 from deworldsg_ros.graph.floor_plan import FloorPlan, floor_plan
 from deworldsg_ros.graph.graph_files import graph_path, read_graph
 from deworldsg_ros.graph.provenance import SeenFrames, SeenSpace, read_seen, read_space
 from deworldsg_ros.graph.rooms import RoomMap
+from deworldsg_ros.graph.seen_cells import SeenCells, ViewCamera
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.scene.vocabulary import SYMMETRIC, plain
@@ -126,17 +128,8 @@ class GraphIndex:
     @cached_property
     def _spheres(self) -> tuple[list[int], Float64, Float64]:
         centers = [box_of(node)[0] for node in self._nodes.values()]
-        radii = [_radius_m(node) for node in self._nodes.values()]
+        radii = [radius_of(node) for node in self._nodes.values()]
         return list(self._nodes), np.array(centers, np.float64).reshape(-1, 3), np.array(radii)
-
-
-def _radius_m(node: wire.NodeState) -> float:
-    # Of a message without a box, the box depends on the surface or the Gaussian.
-    if not isinstance(node.box, wire.GravityBox):
-        return np.inf
-    a, b, c = node.box.size_m
-    # A little more, for the rounding of the exact distance.
-    return 0.5 * (a * a + b * b + c * c) ** 0.5 + 1e-6
 
 
 # --- A scene graph to ask: from a file, or as a client copied it from the topics.
@@ -510,6 +503,17 @@ class SceneGraph:
         return goal_near(
             target, self, distance, self.stamp_ns, robot=robot, towards=towards, space=seen
         )
+
+    def next_view(
+        self,
+        *,
+        robot: Robot = Robot(),
+        start: Point | None = None,
+        camera: ViewCamera | None = None,
+        cells: SeenCells | None = None,
+    ) -> NextView | None:
+        """Where to look next; None = nothing is worth a look. See `next_view.next_view`."""
+        return next_view(self, robot=robot, start=start, camera=camera, cells=cells)
 
     def seen_space(self) -> SeenSpace:
         """What the camera saw: depth images of different views; ClientError if not at hand."""

@@ -27,6 +27,7 @@ from deworldsg_ros.client.changes import Changes
 from deworldsg_ros.client.goals import Robot
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.meanings import is_class
+from deworldsg_ros.client.next_view import NOTHING
 from deworldsg_ros.client.objects import Point
 from deworldsg_ros.graph.embeddings import Looks
 from deworldsg_ros.scene.errors import ClientError, NoService, RefusedInput
@@ -251,6 +252,23 @@ class SceneGraphClient:
             )
         except NoService:
             return self.graph.goal_near(of, distance_m, robot=robot).to_dict()
+
+    def next_view(self, robot: Robot = Robot(), start: Point | None = None) -> dict[str, Any]:
+        """Where to look next, with the fields of `NextView.to_dict`; ``pose`` None = nowhere.
+
+        As `goal_near`, the node computes it and does not publish it. It remembers what all views
+        have shown since the first call. Where no node does, as for fleets and regions, it is
+        computed from the copy, which knows rooms and objects, and no unseen space.
+
+        Args:
+            robot: that is to stand there.
+            start: where it is, world frame; None = where the camera was in the newest frame.
+        """
+        try:
+            return self.command("next_view", start=start, publish=False, **asdict(robot))
+        except NoService:
+            found = self.graph.next_view(robot=robot, start=start)
+            return {"pose": None, "reason": NOTHING} if found is None else found.to_dict()
 
     def explain(self, what: int | str) -> dict[str, Any]:
         """Ask the node why an object is in its graph, or what it knows of a place.

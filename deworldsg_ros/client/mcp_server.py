@@ -17,6 +17,7 @@ from deworldsg_ros.base.words import whole_number
 from deworldsg_ros.client.explain import place_of
 from deworldsg_ros.client.goals import Robot
 from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.client.next_view import NOTHING
 from deworldsg_ros.client.objects import SURE, SceneObject
 from deworldsg_ros.client.questions import ask
 from deworldsg_ros.client.removal import supports_of
@@ -273,6 +274,24 @@ class GraphTools:
             return dict(self._client.goal_near(which, distance_m, robot))
         return self._graph().goal_near(which, distance_m, robot=robot).to_dict()
 
+    def next_view(
+        self, radius_m: float = Robot.radius_m, height_m: float = Robot.height_m
+    ) -> dict[str, Any]:
+        """Give the pose on the floor from which the camera is expected to learn most, with the
+        reason in words, e.g. "cup #3 may be a bowl" or "to see behind couch #5". Go there, then ask
+        again. `pose` null = nothing is worth a look. Example: {"radius_m": 0.25}. Takes less than
+        a second.
+
+        Args:
+            radius_m: half of the robot's width, e.g. 0.25.
+            height_m: of the robot; what is higher is not in its way.
+        """
+        robot = Robot(radius_m, height_m)
+        if self._client is not None:
+            return dict(self._client.next_view(robot))
+        found = self._graph().next_view(robot=robot)
+        return {"pose": None, "reason": NOTHING} if found is None else found.to_dict()
+
     def _graph(self) -> SceneGraph:
         with self._lock:
             graph = self._newest()
@@ -485,6 +504,7 @@ def make_server(newest: Callable[[], SceneGraph], client: Any = None, edits: boo
         tools.if_removed,
         tools.what_changed_since,
         tools.go_to_goal,
+        tools.next_view,
         *edit_tools,
     ]
     server = MCPServer(

@@ -19,7 +19,7 @@ from deworldsg_ros.wire import messages as wire
 
 TOOLS = {
     "list_objects", "list_relations", "list_rooms", "find", "get_object_context", "where_is",
-    "if_removed", "what_changed_since", "go_to_goal",
+    "if_removed", "what_changed_since", "go_to_goal", "next_view",
 }  # fmt: skip
 
 
@@ -61,6 +61,8 @@ def test_an_agent_asks_over_stdio(demo_out):
             assert "exists with" in (await ask("get_object_context", object="cup"))["explanation"]
             goal = await ask("go_to_goal", object="13", distance_m=0.8)
             assert goal["distance_m"] == pytest.approx(0.8)
+            view = await ask("next_view", radius_m=0.25)
+            assert view["reason"] and view["gain_nats"] > 0 and view["header"]["frame_id"]
             assert (await ask("what_changed_since", seconds_ago=5.0))["note"]
             refused = await client.call_tool("go_to_goal", {"object": "elephant"})
             assert refused.is_error and "'elephant'" in refused.content[0].text
