@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from deworldsg_ros.base.words import counted, visible
-from deworldsg_ros.client.boxes import Triple, box_of, footprint, gap_m
+from deworldsg_ros.client.boxes import Triple, box_of, footprint, gap_m, radius_of
 from deworldsg_ros.client.changes import Changes, changes_by_id, changes_by_place
 from deworldsg_ros.client.explain import (
     ANYTHING,
@@ -44,7 +44,6 @@ from deworldsg_ros.client.objects import (
     cheapest_chain,
     hidden_object,
     predicate_names,
-    radius_of,
     relation_of,
     scene_object,
     to_networkx,
