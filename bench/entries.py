@@ -53,6 +53,8 @@ ENTRIES = {
         Entry("memory", "bench.memory:figures", limit_s=120, takes_s=8),
         Entry("building", "bench.building:figures", limit_s=240, takes_s=38),
         Entry("rooms", "bench.rooms:figures", limit_s=240, takes_s=60),
+        Entry("falls", "bench.falls:figures", limit_s=600, takes_s=120),
+        Entry("exploration", "bench.exploration:figures", limit_s=480, takes_s=120),
         Entry("store", "bench.store:figures", limit_s=180, takes_s=20),
         Entry("live_page", "bench.live_page:figures", limit_s=240, takes_s=40),
         Entry("compile", "bench.start:compile_figures", limit_s=240, takes_s=50),

@@ -203,7 +203,7 @@ def _on_something(room: Room, kind: str, rng: np.random.Generator) -> Box | None
 
 
 @numba.njit(cache=True)
-def _cast(origin, rays, boxes, shell):
+def cast(origin, rays, boxes, shell):
     """Depth along each ray (n, 3), and the box that it meets: -1 = a wall, the floor, nothing."""
     depths, hits = np.empty(len(rays)), np.full(len(rays), -1, np.int64)
     for i in range(len(rays)):
@@ -307,14 +307,14 @@ def local_graphs(
     spells: dict[tuple[int, int], int] = {}
     for index, T_room_camera in enumerate(poses):
         rays = rays_camera @ T_room_camera[:3, :3].T
-        depth, hits = _cast(T_room_camera[:3, 3], rays, boxes.reshape(-1, 8), shell)
+        depth, hits = cast(T_room_camera[:3, 3], rays, boxes.reshape(-1, 8), shell)
         sigma = 0.0012 + 0.0019 * (depth - 0.4) ** 2
         depth = np.where(depth > 4.5, 0.0, depth + rng.normal(0, 1, len(depth)) * sigma)
         found = _detect(room, hits, depth, T_room_camera, rng, spells)
         T = T_odom_room @ T_room_camera
         points = (depth[:, None] * rays_camera) @ T[:3, :3].T + T[:3, 3]
         stamp_ns = start_ns + int(index * 1e9 / RATE_HZ)
-        yield _local(found, hits, depth, points, u, v, T, frame_id, stamp_ns)
+        yield local_graph(found, hits, depth, points, u, v, T, frame_id, stamp_ns)
 
 
 def _detect(room, hits, depth, T_room_camera, rng, spells):
@@ -339,7 +339,8 @@ def _detect(room, hits, depth, T_room_camera, rng, spells):
     return found
 
 
-def _local(found, hits, depth, points, u, v, T, frame_id, stamp_ns):
+def local_graph(found, hits, depth, points, u, v, T, frame_id, stamp_ns, vocabulary=VOCABULARY):
+    """What lifting would make of detections: row, pixels, distribution and score of each."""
     means = np.array([points[at].mean(axis=0) for _, at, _, _ in found]).reshape(-1, 3)
     covariances = [np.cov(points[at].T) + 1e-6 * np.eye(3) for _, at, _, _ in found]
     columns, rows = u.ravel(), v.ravel()
@@ -358,17 +359,19 @@ def _local(found, hits, depth, points, u, v, T, frame_id, stamp_ns):
         width=CAMERA.width,
         height=CAMERA.height,
         T_world_camera=T,
-        vocabulary=VOCABULARY,
+        vocabulary=vocabulary,
         instance_ids=np.arange(1, len(found) + 1),
         boxes_xyxy=np.array(boxes, np.float64).reshape(-1, 4),
-        class_probabilities=np.array([item[2] for item in found]).reshape(-1, len(CLASSES)),
+        class_probabilities=np.array([item[2] for item in found]).reshape(
+            -1, len(vocabulary.classes)
+        ),
         scores=np.array([item[3] for item in found], np.float64),
         means_world=means,
         covariances_world=np.array(covariances).reshape(-1, 3, 3),
         depths_m=np.array([depth[at].mean() for _, at, _, _ in found]),
         pixel_counts=np.array([16 * len(at) for _, at, _, _ in found], np.int64),
         surface_points_world=tuple(points[at].astype(np.float32) for _, at, _, _ in found),
-        relations=Relations.none(len(VOCABULARY.predicates)),
+        relations=Relations.none(len(vocabulary.predicates)),
         depth_grid=DepthGrid(
             np.ascontiguousarray(depth_mm[grid]), STRIDE_PX, CAMERA,
             np.ascontiguousarray(instances.reshape(u.shape)[grid]),

@@ -12,9 +12,8 @@ import numpy as np
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph.edits import GraphEdit, NameRoom
-from deworldsg_ros.graph.extent import NodeBoxes
 from deworldsg_ros.graph.graph import GlobalGraph
-from deworldsg_ros.graph.messages import hidden_node
+from deworldsg_ros.graph.messages import NodeBoxes, hidden_node
 from deworldsg_ros.graph.pairs import frame_votes
 from deworldsg_ros.graph.provenance import FrameMemory, SeenSpace, Trail, TrailChange
 from deworldsg_ros.graph.publication import Publication

@@ -30,7 +30,7 @@ from deworldsg_ros.base.words import counted
 from deworldsg_ros.checkpoints.catalogue import require_checkpoints, unused_detector
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
-from deworldsg_ros.cli.outputs import as_report, print_findings, print_part, sizes_of
+from deworldsg_ros.cli.outputs import Album, as_report, print_findings, print_part, sizes_of
 from deworldsg_ros.cli.terminal import (
     dds_environment,
     find_shared,
@@ -51,7 +51,6 @@ from deworldsg_ros.recordings.source import ODOMETRY, Role
 from deworldsg_ros.ros.health import DROPPED, LEFT_OUT, counts_in, observations_of
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError, RecordingError
-from deworldsg_ros.view.photos import Album
 from deworldsg_ros.wire import messages as wire
 
 # --- Processes of the demo: each in its own session with its own log, ended one after the other.

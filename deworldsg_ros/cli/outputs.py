@@ -113,7 +113,7 @@ def show_graph(
         space: what the camera saw of the room; None = the page has no surface of it.
     """
     # Imported here because matplotlib takes a second to load.
-    from deworldsg_ros.view import page, photos, picture
+    from deworldsg_ros.view import page, picture
 
     up = UpEstimator(world_up)
     for T_world_camera in T_world_cameras:
@@ -126,7 +126,7 @@ def show_graph(
             out / PICTURE_FILE,
             up_world=up.up_world(),
             camera_path_world=path_world,
-            photos=photos.photos_of(graph, frames, PHOTO_PX),
+            photos=picture.photos_of(graph, frames, PHOTO_PX),
         )
         page.write(
             graph,
@@ -357,3 +357,29 @@ def print_findings(console: Console, findings: Sequence[Finding]) -> None:
 def as_report(findings: Sequence[Finding]) -> list[dict[str, Any]]:
     """Findings for run.json."""
     return [asdict(finding) for finding in findings]
+
+
+# --- Frames of a recording, of which the photos of objects are cut.
+
+# Frames of a recording that are kept: 64 MB, and at least as many as a walk around a room needs.
+MOST_BYTES, LEAST_FRAMES = 64 << 20, 8
+
+
+class Album:
+    """Keeps frames of a recording, evenly spaced, however long it is."""
+
+    def __init__(self) -> None:
+        self.frames: list[RgbdFrame] = []
+        self._every = 1
+        self._count = 0
+
+    def add(self, frame: RgbdFrame) -> None:
+        """Keep a frame, or not."""
+        if self._count % self._every == 0:
+            size = frame.rgb.nbytes + frame.depth_m.nbytes
+            if len(self.frames) >= max(MOST_BYTES // size, LEAST_FRAMES):
+                del self.frames[1::2]
+                self._every *= 2
+            if self._count % self._every == 0:
+                self.frames.append(frame)
+        self._count += 1

@@ -32,6 +32,7 @@ from deworldsg_ros.base.words import counted, visible
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.outputs import (
+    Album,
     RunObserver,
     as_report,
     print_drops,
@@ -69,7 +70,6 @@ from deworldsg_ros.scene.errors import (
     RecordingError,
     RefusedInput,
 )
-from deworldsg_ros.view.photos import Album
 from deworldsg_ros.wire import messages as wire
 
 # --- `deworldsg run`: build the scene graph of a recording in one process, without ROS.

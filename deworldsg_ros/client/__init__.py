@@ -11,7 +11,10 @@ from deworldsg_ros.client.changes import Changes, Pairing
 from deworldsg_ros.client.explain import Explanation
 from deworldsg_ros.client.goals import Goal, Robot
 from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.client.next_view import NextView
 from deworldsg_ros.client.objects import HiddenObject, Relation, Room, Rooms, SceneObject
+from deworldsg_ros.client.removal import Order, Removal
+from deworldsg_ros.graph.seen_cells import ViewCamera
 from deworldsg_ros.scene.errors import ClientError
 
 if TYPE_CHECKING:
@@ -23,14 +26,18 @@ __all__ = [
     "Explanation",
     "Goal",
     "HiddenObject",
+    "Order",
+    "NextView",
     "Pairing",
     "Relation",
+    "Removal",
     "Robot",
     "Room",
     "Rooms",
     "SceneGraph",
     "SceneGraphClient",
     "SceneObject",
+    "ViewCamera",
 ]
 
 

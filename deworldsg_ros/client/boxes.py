@@ -67,6 +67,15 @@ def box_of(node: wire.NodeState) -> tuple[Triple, Triple]:
     return (x, y, z), (0.0, 0.0, 0.0)
 
 
+def radius_of(node: wire.NodeState) -> float:
+    """A radius around the centre of `box_of`, metres; infinite if the message has no box."""
+    if not isinstance(node.box, wire.GravityBox):
+        return np.inf
+    a, b, c = node.box.size_m
+    # A little more, for the rounding of the exact distance.
+    return 0.5 * (a * a + b * b + c * c) ** 0.5 + 1e-6
+
+
 def horizontal_gap_m(a: Footprint, b: Footprint) -> float:
     """Horizontal distance of two boxes; 0 if they overlap seen from above."""
     return polygon_gap_m(a.corners, b.corners)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -56,6 +56,53 @@ class Robot:
             )
 
 
+class Posed(Protocol):
+    """A pose in the world at a time: a `Goal`, or a `NextView`."""
+
+    @property
+    def position_m(self) -> Point:
+        """On the floor, world frame."""
+
+    @property
+    def orientation_xyzw(self) -> tuple[float, float, float, float]:
+        """X axis ahead, z axis up."""
+
+    @property
+    def frame_id(self) -> str:
+        """The world frame."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the graph."""
+
+
+def pose_fields(goal: Posed) -> dict[str, Any]:
+    """The fields of a geometry_msgs/PoseStamped, for JSON."""
+    position = dict(zip("xyz", (round(value, 3) + 0.0 for value in goal.position_m)))
+    turn = dict(zip("xyzw", (round(value, 5) + 0.0 for value in goal.orientation_xyzw)))
+    sec, nanosec = divmod(goal.stamp_ns, 10**9)
+    return {
+        "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": goal.frame_id},
+        "pose": {"position": position, "orientation": turn},
+    }
+
+
+def pose_stamped(goal: Posed) -> Any:
+    """The pose as geometry_msgs/PoseStamped; needs ROS 2."""
+    from builtin_interfaces.msg import Time
+    from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+    from std_msgs.msg import Header
+
+    sec, nanosec = divmod(goal.stamp_ns, 10**9)
+    x, y, z = goal.position_m
+    qx, qy, qz, qw = goal.orientation_xyzw
+    position, turn = Point(x=x, y=y, z=z), Quaternion(x=qx, y=qy, z=qz, w=qw)
+    return PoseStamped(
+        header=Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=goal.frame_id),
+        pose=Pose(position=position, orientation=turn),
+    )
+
+
 @dataclass(frozen=True)
 class Goal:
     """A pose on the floor from which an object is in view.
@@ -98,12 +145,8 @@ class Goal:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON, with the fields of a geometry_msgs/PoseStamped."""
-        position = dict(zip("xyz", (round(value, 3) + 0.0 for value in self.position_m)))
-        turn = dict(zip("xyzw", (round(value, 5) + 0.0 for value in self.orientation_xyzw)))
-        sec, nanosec = divmod(self.stamp_ns, 10**9)
         return {
-            "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": self.frame_id},
-            "pose": {"position": position, "orientation": turn},
+            **pose_fields(self),
             "target": {"id": self.target.id, "label": self.target.label},
             "target_probability": round(self.target.probability, 3),
             "distance_m": round(self.distance_m, 3),
@@ -121,18 +164,7 @@ class Goal:
 
     def pose_stamped(self) -> Any:
         """The pose as geometry_msgs/PoseStamped; needs ROS 2."""
-        from builtin_interfaces.msg import Time
-        from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
-        from std_msgs.msg import Header
-
-        sec, nanosec = divmod(self.stamp_ns, 10**9)
-        x, y, z = self.position_m
-        qx, qy, qz, qw = self.orientation_xyzw
-        position, turn = Point(x=x, y=y, z=z), Quaternion(x=qx, y=qy, z=qz, w=qw)
-        return PoseStamped(
-            header=Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=self.frame_id),
-            pose=Pose(position=position, orientation=turn),
-        )
+        return pose_stamped(self)
 
 
 def goal_near(

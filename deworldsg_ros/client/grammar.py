@@ -17,7 +17,8 @@ from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 #               | [ "how many" | "is" | "what colour" ] pattern
 #     pattern   = [ ordinal ] [ rank ] thing { [ "and" ] condition }
 #     thing     = [ colour ] ( class | "anything" ) | colour
-#     condition = [ "not" ] predicate thing | "near" point | rank | nearest "to" ( thing | point )
+#     condition = [ "not" ] predicate thing [ "all the way up" ] | "near" point
+#               | rank | nearest "to" ( thing | point )
 #               | "within" length [ "of" ( thing | point ) ] | colour
 #     colour    = "black", "white", "grey", "red", …
 #     rank      = "largest", "smallest", "highest", … | nearest
@@ -30,6 +31,8 @@ from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 # "in the kitchen" is a condition with a room. A thing may be a room: "rooms next to the hall",
 # "bedrooms with a desk". "which room is the cup in" is "room with cup".
 #
+# "what rests on the shelf, all the way up" has what is on the shelf, on that, and so on.
+#
 # Articles and words such as "which", "where", "there", "could you tell me" are skipped, and so is a
 # last "in the room" or "here".
 
@@ -38,14 +41,18 @@ SKIPPED = frozenset(
         *("a", "an", "the", "is", "are", "was", "which", "where", "find", "show", "all", "that"),
         *("there", "any", "me", "please", "do", "you", "i", "see", "can", "it", "one", "does"),
         *("could", "would", "tell", "know", "we", "us", "have", "got", "did", "leave", "put"),
-        *("my", "our", "your", "this", "hey", "robot"),
+        *("my", "our", "your", "this", "hey", "robot", "rests", "rest", "resting"),
     }
 )
+# After a support: also what rests on it by other things.
+ALL_THE_WAY = ["all", "the", "way", "up"]
 CONTRACTIONS = {
     **{f"{word}{s}": f"{word} is" for word in ("what", "where", "there") for s in ("'s", "s")},
     **{f"{word}{nt}": f"{word} not" for word in ("is", "are") for nt in ("n't", "nt")},
 }
 PLACES = frozenset({"room", "here", "view", "scene"})
+# Relations with what carries or contains an object.
+CARRYING = frozenset(PREDICATES[0] + PREDICATES[1])
 # What people say for near.
 NEAR_WORDS = frozenset({"next to", "beside", "close by", "close to", "around", "by"})
 ANYTHING = frozenset(
@@ -96,6 +103,7 @@ class Condition:
         is_negated: whether it has to be false.
         colour: of the other object; None = any.
         own_colour: of the object itself; there is nothing else then.
+        all_the_way: whether other things may be between the object and what it rests on.
     """
 
     predicate: str | None = None
@@ -105,6 +113,7 @@ class Condition:
     is_negated: bool = False
     colour: str | None = None
     own_colour: str | None = None
+    all_the_way: bool = False
 
 
 @dataclass(frozen=True)
@@ -190,6 +199,8 @@ def parse(question: str, predicates: Collection[str] = ()) -> Pattern | Since | 
         return _since(question, tokens[2:])
     if tokens[:1] == ["like"]:
         return Like(question.split(maxsplit=1)[1].strip("\"'“” ") if tokens[1:] else "")
+    all_the_way = tokens[-len(ALL_THE_WAY) :] == ALL_THE_WAY
+    tokens = tokens[: -len(ALL_THE_WAY)] if all_the_way else tokens
     kind: Kind = "find"
     if tokens[:2] == ["how", "many"]:
         kind, tokens = "count", tokens[2:]
@@ -205,7 +216,18 @@ def parse(question: str, predicates: Collection[str] = ()) -> Pattern | Since | 
         tokens = ["room", "with", *asked[2:]]
     if tokens[:2] in (["what", "colour"], ["what", "color"]):
         kind, tokens = "colour", tokens[3:] if tokens[2:3] == ["of"] else tokens[2:]
-    return _Reader(question, tokens, _longest_first(predicates)).pattern(kind)
+    pattern = _Reader(question, tokens, _longest_first(predicates)).pattern(kind)
+    return _all_the_way(question, pattern) if all_the_way else pattern
+
+
+def _all_the_way(question: str, pattern: Pattern) -> Pattern:
+    """The pattern with its last condition all the way up."""
+    *others, last = pattern.conditions or (Condition(),)
+    if last.predicate not in CARRYING:
+        raise ClientError(
+            f"question '{question}': expected 'on' or 'in' and a thing before 'all the way up'"
+        )
+    return replace(pattern, conditions=(*others, replace(last, all_the_way=True)))
 
 
 class _Reader:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from deworldsg_ros.base.words import counted, visible
-from deworldsg_ros.client.boxes import Triple, box_of, footprint, gap_m
+from deworldsg_ros.client.boxes import Triple, box_of, footprint, gap_m, radius_of
 from deworldsg_ros.client.changes import Changes, changes_by_id, changes_by_place
 from deworldsg_ros.client.explain import (
     ANYTHING,
@@ -35,6 +33,7 @@ from deworldsg_ros.client.meanings import (
     near_names,
     words_of,
 )
+from deworldsg_ros.client.next_view import NextView, next_view
 from deworldsg_ros.client.objects import (
     HiddenObject,
     Point,
@@ -42,20 +41,22 @@ from deworldsg_ros.client.objects import (
     Room,
     Rooms,
     SceneObject,
+    cheapest_chain,
     hidden_object,
     predicate_names,
     relation_of,
     scene_object,
     to_networkx,
 )
-from deworldsg_ros.client.text_tower import embed_text
-from deworldsg_ros.graph.embeddings import Looks, embeddings_path, read_embeddings
+from deworldsg_ros.client.removal import Order, Removal, Removals, resting_on
+from deworldsg_ros.graph.embeddings import Looks, embed_text, embeddings_path, read_embeddings
 from deworldsg_ros.graph.extent import DEFAULT_UP
 from deworldsg_ros.graph.floor_plan import CELL_M as PLAN_CELL_M
 from deworldsg_ros.graph.floor_plan import FloorPlan, floor_plan
 from deworldsg_ros.graph.graph_files import graph_path, read_graph
 from deworldsg_ros.graph.provenance import SeenFrames, SeenSpace, read_seen, read_space
 from deworldsg_ros.graph.rooms import RoomMap
+from deworldsg_ros.graph.seen_cells import SeenCells, ViewCamera
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ClientError
 from deworldsg_ros.scene.vocabulary import SYMMETRIC, plain
@@ -126,49 +127,8 @@ class GraphIndex:
     @cached_property
     def _spheres(self) -> tuple[list[int], Float64, Float64]:
         centers = [box_of(node)[0] for node in self._nodes.values()]
-        radii = [_radius_m(node) for node in self._nodes.values()]
+        radii = [radius_of(node) for node in self._nodes.values()]
         return list(self._nodes), np.array(centers, np.float64).reshape(-1, 3), np.array(radii)
-
-
-def _radius_m(node: wire.NodeState) -> float:
-    # Of a message without a box, the box depends on the surface or the Gaussian.
-    if not isinstance(node.box, wire.GravityBox):
-        return np.inf
-    a, b, c = node.box.size_m
-    # A little more, for the rounding of the exact distance.
-    return 0.5 * (a * a + b * b + c * c) ** 0.5 + 1e-6
-
-
-# --- The most probable chain of relations between two objects.
-
-
-def cheapest_chain(
-    edges: Mapping[tuple[int, int], wire.EdgeState], first: int, last: int
-) -> list[wire.EdgeState]:
-    """The edges of the chain with the largest product of probabilities; [] if there is none.
-
-    Edges are used in both directions.
-    """
-    links: dict[int, list[tuple[float, int, wire.EdgeState]]] = {}
-    for (a, b), edge in edges.items():
-        # Of two equal chains, the shorter one.
-        cost = 1e-6 - math.log(min(max(edge.probability, 1e-9), 1.0))
-        links.setdefault(a, []).append((cost, b, edge))
-        links.setdefault(b, []).append((cost, a, edge))
-    costs = {first: 0.0}
-    came: dict[int, tuple[int, wire.EdgeState]] = {}
-    waiting = [(0.0, first)]
-    while waiting:
-        cost, node = heapq.heappop(waiting)
-        for step, other, edge in links.get(node, ()):
-            if cost + step < costs.get(other, math.inf):
-                costs[other], came[other] = cost + step, (node, edge)
-                heapq.heappush(waiting, (cost + step, other))
-    chain: list[wire.EdgeState] = []
-    while last != first and last in came:
-        last, edge = came[last]
-        chain.insert(0, edge)
-    return chain
 
 
 # --- A scene graph to ask: from a file, or as a client copied it from the topics.
@@ -500,6 +460,30 @@ class SceneGraph:
         chain = cheapest_chain(self._edges, self.one(start).id, self.one(end).id)
         return [relation_of(edge, self[edge.subject], self[edge.object], None) for edge in chain]
 
+    def resting_on(self, support: Which) -> list[tuple[SceneObject, float]]:
+        """What rests on an object, all the way up, with probabilities; see `removal`."""
+        return resting_on(self, self.one(support))
+
+    def if_removed(self, which: Which) -> Removal:
+        """What moves if an object is taken away, with probabilities.
+
+        Raises:
+            ClientError: without the package mujoco (the extra ``physics``).
+        """
+        return self._removals.without(self.one(which))
+
+    def order_to_take(self, which: Which) -> Order:
+        """What to take first, so that nothing falls when an object is taken; see `if_removed`."""
+        return self._removals.order(self.one(which))
+
+    def order_to_clear(self, support: Which) -> Order:
+        """In which order to take all that rests on an object, so that nothing falls."""
+        return self._removals.clearing(self.one(support))
+
+    @cached_property
+    def _removals(self) -> Removals:
+        return Removals(self)
+
     def free_direction(self, of: Which, towards: Point | None = None, room: float = 1.0) -> Point:
         """A horizontal direction in which an object has room; see `goals.free_direction`."""
         return free_direction(self.one(of), self, towards, room)
@@ -518,6 +502,17 @@ class SceneGraph:
         return goal_near(
             target, self, distance, self.stamp_ns, robot=robot, towards=towards, space=seen
         )
+
+    def next_view(
+        self,
+        *,
+        robot: Robot = Robot(),
+        start: Point | None = None,
+        camera: ViewCamera | None = None,
+        cells: SeenCells | None = None,
+    ) -> NextView | None:
+        """Where to look next; None = nothing is worth a look. See `next_view.next_view`."""
+        return next_view(self, robot=robot, start=start, camera=camera, cells=cells)
 
     def seen_space(self) -> SeenSpace:
         """What the camera saw: depth images of different views; ClientError if not at hand."""

@@ -6,6 +6,8 @@ import functools
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as FutureTimeout
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -15,18 +17,25 @@ from deworldsg_ros.base.words import whole_number
 from deworldsg_ros.client.explain import place_of
 from deworldsg_ros.client.goals import Robot
 from deworldsg_ros.client.graph import SceneGraph
-from deworldsg_ros.client.objects import SceneObject
+from deworldsg_ros.client.next_view import NOTHING
+from deworldsg_ros.client.objects import SURE, SceneObject
 from deworldsg_ros.client.questions import ask
+from deworldsg_ros.client.removal import supports_of
 from deworldsg_ros.graph.graph_files import GRAPH_FILE
 from deworldsg_ros.scene.errors import ClientError, DeWorldSGError, RefusedInput
 from deworldsg_ros.scene.limits import MAX_SECONDS
 
 # --- The tools of the MCP server: questions with plain arguments, answers as plain values.
 
-# Graphs that are remembered for `what_changed`.
+# Graphs that are remembered for `what_changed_since`.
 MOST_GRAPHS = 256
 # Objects and relations of one answer; an agent reads all of them.
 MOST_ANSWERS = 50
+# Places that `where_is` tells of one question.
+MOST_OTHERS = 4
+# A question is answered in this time, or with an error that says so. So many run at the same time:
+# one that takes too long goes on until it ends.
+LIMIT_S, MOST_AT_ONCE = 20.0, 8
 # An object: its id, as a number or as text such as "#12", or its class.
 Named = int | str
 
@@ -134,10 +143,7 @@ class GraphTools:
         return {
             **_about(graph),
             "object": item.to_dict(),
-            "rooms": [
-                {"id": room.id, "label": room.label, "probability": share}
-                for room, share in graph.rooms.of(item.id)
-            ],
+            "rooms": _rooms(graph, item),
             "relations": [relation.to_dict() for relation in graph.relations_of(item)],
             "neighbours": [
                 {"id": other.id, "label": other.label, "gap_m": round(gap, 3)}
@@ -146,16 +152,84 @@ class GraphTools:
             "explanation": str(graph.explain(item)),
         }
 
-    def what_changed(self, seconds_ago: float = 60.0) -> dict[str, Any]:
+    def where_is(self, object: Named) -> dict[str, Any]:
+        """Tell where an object is: place, room, what it rests on, when it was seen, how sure.
+
+        Example: where_is(object="red cup on the table").
+
+        Args:
+            object: in words, as for `find`, or an id. `others` are further objects that fit, the
+                most probable first; `found` is false if there is none, and `notes` say why.
+        """
+        graph = self._graph()
+        which = _which(object)
+        if which is None:
+            raise ClientError("object is empty: expected words or an id")
+        if isinstance(which, int):
+            ranked, notes = [(graph[which], graph[which].probability)], tuple[str, ...]()
+        else:
+            answers = ask(graph, which)
+            ranked = [(one.item, one.probability) for one in answers.found[:MOST_OTHERS]]
+            notes = answers.notes
+        places = [
+            {
+                **_short(item),
+                "probability": round(chance, 3),
+                "sure": chance >= SURE,
+                "rooms": _rooms(graph, item),
+                "rests_on": [
+                    {"id": other, "label": graph[other].label, "probability": round(share, 3)}
+                    for other, (share, _) in supports_of(graph, item).items()
+                ],
+                "last_seen_s": item.last_seen_ns / 1e9,
+                "seen_seconds_ago": (graph.stamp_ns - item.last_seen_ns) / 1e9,
+            }
+            for item, chance in ranked
+        ]
+        answer = {**_about(graph), "found": bool(places), "notes": list(notes)}
+        return {**answer, "object": places[0], "others": places[1:]} if places else answer
+
+    def if_removed(self, object: Named, clear: bool = False) -> dict[str, Any]:
+        """Tell what falls or moves if an object is taken, and what to take before it.
+
+        Example: if_removed(object="pan"). `moves` has the odds of each object, `safe` whether it
+        can be taken now, and `steps` the order in which everything can be taken, the object last.
+
+        Args:
+            object: id, or class.
+            clear: the steps take all that rests on the object, e.g. a shelf, and leave it there.
+        """
+        graph = self._graph()
+        item = graph.one(_named(object))
+        order = graph.order_to_clear(item) if clear else graph.order_to_take(item)
+        steps = [step.to_dict() for step in order.steps]
+        removal = graph.if_removed(item)
+        return {
+            **_about(graph),
+            **removal.to_dict(),
+            "steps": steps,
+            "steps_safe": order.is_safe,
+            "lines": removal.lines,
+        }
+
+    def what_changed_since(
+        self, seconds_ago: float = 60.0, since_s: float | None = None
+    ) -> dict[str, Any]:
         """Tell which objects were added, went, moved or were renamed since a time.
+
+        Example: what_changed_since(seconds_ago=600). `times` says when, one sentence a change.
 
         Args:
             seconds_ago: before the newest frame of the graph.
+            since_s: a stamp in seconds, such as `stamp_s` of an earlier answer, in its place.
         """
-        if not abs(seconds_ago) <= MAX_SECONDS:
-            raise ClientError(f"seconds_ago {seconds_ago:g}: expected at most {MAX_SECONDS}")
         graph = self._graph()
-        start_ns = graph.stamp_ns - round(seconds_ago * 1e9)
+        ago_s = seconds_ago if since_s is None else graph.stamp_ns / 1e9 - since_s
+        if not abs(ago_s) <= MAX_SECONDS:
+            name = "seconds_ago" if since_s is None else "since_s"
+            value = seconds_ago if since_s is None else since_s
+            raise ClientError(f"{name} {value:g}: expected at most {MAX_SECONDS}")
+        start_ns = graph.stamp_ns - round(ago_s * 1e9)
         with self._lock:
             known = list(self._known)
         earlier = [item for item in known if item.stamp_ns <= start_ns]
@@ -167,22 +241,24 @@ class GraphTools:
         }
         if before is not graph:
             changes = graph.changes_since(before)
-            answer.update(changes.to_dict(), lines=changes.lines)
+            answer.update(changes.to_dict(), lines=changes.lines, times=changes.dated_lines)
         if not earlier:
             answer["note"] = (
                 "no graph of that time is known: the comparison starts when this server started"
             )
         return answer
 
-    def goal_near(
+    def go_to_goal(
         self,
         object: Named,
         distance_m: float = 1.0,
         radius_m: float = Robot.radius_m,
         height_m: float = Robot.height_m,
     ) -> dict[str, Any]:
-        """Give a pose on the floor from which an object is in view, for a navigation goal.
+        """Give the pose on the floor to go to, from which an object is in view.
 
+        Example: go_to_goal(object="cup", distance_m=0.8). `header` and `pose` are those of a
+        geometry_msgs/PoseStamped: send them to Nav2 as the goal; this tool drives no robot.
         `seen_free` is the share of the robot's volume there that was seen as free; null = walls are
         not known.
 
@@ -192,13 +268,29 @@ class GraphTools:
             radius_m: half of the robot's width.
             height_m: of the robot; what is higher is not in its way.
         """
-        which = _which(object)
-        if which is None:
-            raise ClientError("object is empty: expected an id or a class")
+        which = _named(object)
         robot = Robot(radius_m, height_m)
         if self._client is not None:
             return dict(self._client.goal_near(which, distance_m, robot))
         return self._graph().goal_near(which, distance_m, robot=robot).to_dict()
+
+    def next_view(
+        self, radius_m: float = Robot.radius_m, height_m: float = Robot.height_m
+    ) -> dict[str, Any]:
+        """Give the pose on the floor from which the camera is expected to learn most, with the
+        reason in words, e.g. "cup #3 may be a bowl" or "to see behind couch #5". Go there, then ask
+        again. `pose` null = nothing is worth a look. Example: {"radius_m": 0.25}. Takes less than
+        a second.
+
+        Args:
+            radius_m: half of the robot's width, e.g. 0.25.
+            height_m: of the robot; what is higher is not in its way.
+        """
+        robot = Robot(radius_m, height_m)
+        if self._client is not None:
+            return dict(self._client.next_view(robot))
+        found = self._graph().next_view(robot=robot)
+        return {"pose": None, "reason": NOTHING} if found is None else found.to_dict()
 
     def _graph(self) -> SceneGraph:
         with self._lock:
@@ -299,6 +391,20 @@ def _short(item: SceneObject) -> dict[str, Any]:
     return {name: values[name] for name in names} | guesses
 
 
+def _rooms(graph: SceneGraph, item: SceneObject) -> list[dict[str, Any]]:
+    return [
+        {"id": room.id, "label": room.label, "probability": share}
+        for room, share in graph.rooms.of(item.id)
+    ]
+
+
+def _named(text: Named) -> int | str:
+    which = _which(text)
+    if which is None:
+        raise ClientError("object is empty: expected an id or a class")
+    return which
+
+
 def _which(text: Named) -> int | str | None:
     text = str(text).strip().removeprefix("#")
     number = whole_number(text)
@@ -312,8 +418,43 @@ INSTRUCTIONS = (
     "A live 3D scene graph of a robot's surroundings: objects with positions and sizes in metres, "
     "and relations between them. Every answer has a probability; `sure` is false below odds of "
     "2 : 1, and then say that you are not sure. Positions are in the frame `frame_id`; `up` points "
-    "against gravity. Start with list_objects or find."
+    "against gravity. Every tool answers within 20 s, or says that it does not. Start with "
+    "where_is, list_objects or find."
 )
+
+
+def within(
+    limit_s: float, places: threading.Semaphore, call: Callable[[], dict[str, Any]]
+) -> dict[str, Any]:
+    """The answer of a call, within a time.
+
+    Args:
+        limit_s: seconds.
+        places: one is taken while the call runs, also if its answer is not waited for any more.
+        call: to make.
+
+    Raises:
+        ClientError: if the call takes longer, or all places are taken.
+    """
+    if not places.acquire(timeout=limit_s):
+        raise ClientError("busy: earlier questions still run; ask again later")
+    answer: Future[dict[str, Any]] = Future()
+
+    def run() -> None:
+        try:
+            answer.set_result(call())
+        except BaseException as error:  # it is raised where the answer is awaited
+            answer.set_exception(error)
+        finally:
+            places.release()
+
+    threading.Thread(target=run, daemon=True).start()
+    try:
+        return answer.result(limit_s)
+    except FutureTimeout as error:
+        raise ClientError(
+            f"no answer within {limit_s:g} s: ask for fewer objects, or for one by its id"
+        ) from error
 
 
 def make_server(newest: Callable[[], SceneGraph], client: Any = None, edits: bool = False) -> Any:
@@ -335,11 +476,16 @@ def make_server(newest: Callable[[], SceneGraph], client: Any = None, edits: boo
             "the MCP server needs the package mcp, version 2: pip install 'deworldsg_ros[mcp]'"
         ) from error
 
+    places = threading.BoundedSemaphore(MOST_AT_ONCE)
+    edit_tools = list(EditTools(client)) if edits else []
+
     def reporting(function: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
         @functools.wraps(function)
         def call(*arguments: Any, **named: Any) -> dict[str, Any]:
             try:
-                return function(*arguments, **named)
+                asked = functools.partial(function, *arguments, **named)
+                # An edit has to end, and has a limit of its own.
+                return asked() if function in edit_tools else within(LIMIT_S, places, asked)
             except DeWorldSGError as error:
                 raise ToolError(str(error)) from error
             except Exception as error:  # an agent would be told nothing but that it failed
@@ -354,9 +500,12 @@ def make_server(newest: Callable[[], SceneGraph], client: Any = None, edits: boo
         tools.list_rooms,
         tools.find,
         tools.get_object_context,
-        tools.what_changed,
-        tools.goal_near,
-        *(EditTools(client) if edits else []),
+        tools.where_is,
+        tools.if_removed,
+        tools.what_changed_since,
+        tools.go_to_goal,
+        tools.next_view,
+        *edit_tools,
     ]
     server = MCPServer(
         "deworldsg", version=__version__, instructions=INSTRUCTIONS, log_level="WARNING"

@@ -24,6 +24,7 @@ from deworldsg_ros.client.objects import (
     odds_of,
     room_words,
 )
+from deworldsg_ros.client.removal import carriers_of
 from deworldsg_ros.scene.errors import ClientError
 
 # Answers that are less probable are left out.
@@ -424,7 +425,7 @@ def _words(condition: Condition) -> str:
     thing = thing if condition.colour is None else f"{condition.colour} {thing}"
     if condition.predicate is None:
         return f"within {condition.within_m or 0.0:g} m of {thing}"
-    return f"{condition.predicate} {thing}"
+    return f"{condition.predicate} {thing}{', all the way up' * condition.all_the_way}"
 
 
 def _best_part(
@@ -449,6 +450,8 @@ def _best_part(
         ]
         return max(inside, key=lambda part: part[0], default=None)
     budget.spend(1)
+    if condition.all_the_way:
+        return _carried(graph, item, condition, is_certain, budget)
     best: dict[int, Relation] = {}
     if condition.predicate is None:
         around = graph.objects(near=item, within=condition.within_m or 0.0)
@@ -473,6 +476,24 @@ def _best_part(
         said = relation.predicate if relation.subject.id == item.id else condition.predicate
         text = f"{said} {of}: {relation.probability:.0%}, {relation.evidence}"
         parts.append((counted_chance * relation.probability, relation, text))
+    return max(parts, key=lambda part: part[0], default=None)
+
+
+def _carried(
+    graph: SceneGraph, item: SceneObject, condition: Condition, is_certain: bool, budget: _Budget
+) -> _Part | None:
+    """The most probable thing that carries an object, with others between them or without."""
+    carriers = carriers_of(graph, item)
+    budget.spend(len(carriers))
+    around = [graph[node_id] for node_id in sorted(carriers)]
+    parts: list[_Part] = [
+        (
+            (of_colour if is_certain else chance * of_colour) * carriers[other.id],
+            None,
+            f"rests on {other.name}, all the way down: {carriers[other.id]:.0%}",
+        )
+        for other, chance, of_colour in _things(around, condition.thing, condition.colour)
+    ]
     return max(parts, key=lambda part: part[0], default=None)
 
 

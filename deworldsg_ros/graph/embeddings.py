@@ -1,9 +1,15 @@
-"""What the nodes look like, as vectors of one model: fused over viewpoints, saved, and compared."""
+"""What the nodes look like, as vectors of one model: fused over viewpoints, saved, and compared.
+
+Also with texts, as vectors of the same model.
+"""
 
 from __future__ import annotations
 
+import functools
+import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +20,7 @@ from numpy.typing import NDArray
 from deworldsg_ros.base.array_file import read_arrays, write_arrays
 from deworldsg_ros.scene.arrays import Float16, Float32, Float64, Int64
 from deworldsg_ros.scene.checks import checked, contained, distinct, holds, lengths, within
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import ClientError, RefusedInput
 from deworldsg_ros.scene.frame_graph import Embeddings
 from deworldsg_ros.scene.limits import MAX_EMBEDDING, check_names
 from deworldsg_ros.wire import messages as wire
@@ -336,3 +342,98 @@ def read_embeddings(path: Path, stamp_ns: int | None = None) -> Looks | None:
         raise RefusedInput("unreadable_embeddings", f"embeddings {path}: {error}") from error
     views = embeddings.views
     return Looks(embeddings.model, embeddings.of(views)) if views else None
+
+
+# --- Texts as vectors of CLIP or SigLIP, to compare with what objects look like.
+
+# A longer text is cut by the networks, which take 64 or 77 tokens.
+MAX_TEXT = 500
+
+
+def embed_text(model: str, text: str) -> Float32:
+    """The vector (D,) of a text, not scaled.
+
+    Args:
+        model: of the embeddings: CLIP, SigLIP or SigLIP 2, a folder or a hub id in the local cache.
+        text: what is looked for, e.g. "something to drink from".
+
+    Raises:
+        ClientError: without torch and transformers, or without the model.
+    """
+    if not text.strip() or len(text) > MAX_TEXT:
+        raise ClientError(f"text of {len(text)} characters: expected 1 to {MAX_TEXT}")
+    network, tokenizer, padding = _tower(model)
+    import torch
+
+    length = network.config.max_position_embeddings
+    tokens = tokenizer(
+        text.lower(), padding=padding, truncation=True, max_length=length, return_tensors="pt"
+    )
+    with torch.inference_mode():
+        # SigLIP was trained without a mask of the padding.
+        output = network(input_ids=tokens["input_ids"])
+    found = getattr(output, "text_embeds", None)
+    features = output.pooler_output if found is None else found
+    return np.asarray(features[0].float().numpy(), np.float32)
+
+
+@contextmanager
+def one_tower() -> Iterator[None]:
+    """Load one of the two towers of a checkpoint, without a list of the other one in the log."""
+    logger = logging.getLogger("transformers")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+@functools.lru_cache(maxsize=2)
+def _tower(model: str) -> tuple[Any, Any, Any]:
+    """The network of texts, its tokenizer, and the padding of its training."""
+    try:
+        import torch
+        import transformers
+    except ImportError as error:
+        raise ClientError(
+            f"texts are compared with objects by torch and transformers ({error}): pip install "
+            "torch transformers"
+        ) from error
+    families = {
+        "clip": transformers.CLIPTextModelWithProjection,
+        "siglip": transformers.SiglipTextModel,
+    }
+    try:
+        with one_tower():
+            return _load(transformers, model, families, torch.float32)
+    except ClientError:
+        raise
+    except Exception as error:  # transformers raises errors of many types
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+        raise ClientError(
+            f"the embeddings are of {model!r}, whose texts cannot be loaded ({reason}): expected a "
+            f"folder or hub id in the local cache (hf download {model}), with its tokenizer"
+        ) from error
+
+
+def _load(
+    transformers: Any, model: str, families: dict[str, Any], dtype: Any
+) -> tuple[Any, Any, Any]:
+    """See `_tower`; raises errors of many types."""
+    transformers.utils.logging.disable_progress_bar()
+    whole = transformers.AutoConfig.from_pretrained(model, local_files_only=True)
+    if whole.model_type not in families:
+        raise ClientError(
+            f"the embeddings are of {model!r}, a checkpoint of {whole.model_type}: expected "
+            "CLIP or SigLIP, which have texts, too"
+        )
+    config = whole.text_config
+    if whole.model_type == "clip":
+        config.projection_dim = whole.projection_dim
+    network = families[whole.model_type].from_pretrained(
+        model, config=config, dtype=dtype, use_safetensors=True, local_files_only=True
+    )
+    tokenizer = transformers.AutoTokenizer.from_pretrained(model, local_files_only=True)
+    padding = "max_length" if whole.model_type == "siglip" else False
+    return network.eval(), tokenizer, padding

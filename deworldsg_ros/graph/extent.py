@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
-from msgspec import UNSET
 
 from deworldsg_ros.base.kernels import kernel
-from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
-from deworldsg_ros.scene.camera import invert_pose, pose_from_quaternion, quaternion_from_rotation
+from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.scene.checks import check_array
-from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M
 from deworldsg_ros.wire import messages as wire
 
@@ -37,29 +32,13 @@ FEW_POINTS = 6
 PART_GAP_M, SMALL_PART = 0.12, 0.1
 # With fewer points that the images show as the node's, its box is around all points.
 MIN_SHOWN_POINTS = 8
-# A frame shows where a side of a box ends if it shows what is beyond this fraction at least of the
-# points so near its end: what is so far beyond them is in the image, and nothing is before it by
-# the noise of a camera.
-END_M, BEYOND_M = 0.04, 0.06
-SEEN_FRACTION = 0.3
-BEFORE_M, BEFORE_FRACTION = 0.03, 0.01
-# Points are of a box up to this distance from it.
-AROUND_M = 0.02
-# Ends of two boxes are the same within `END_M` if their axes are within this.
-SAME_COS = math.cos(math.radians(15.0))
-# A side may go on if at least MIN_CUT frames do not show its end, and at most MAX_SEEN of all do:
-# masks and depth are wrong in some. It may also go on if as many frames show the object beyond it
-# as show something else there.
-MIN_CUT, MAX_SEEN = 2, 0.1
-# An object rests on what at least MIN_RESTS of the last RESTS frames show, less than `BEYOND_M`
-# below its points: masks end a little above. A frame counts if it shows it below at least MIN_BELOW
-# points.
-MIN_RESTS, RESTS, MIN_BELOW = 3, 9, 3
 # Weights of points with these many points around.
 _EVEN_WEIGHTS = np.append(0.0, np.arange(1.0, 4097.0) ** -0.5)
-# Headings of a box, over 90 degrees. The smallest rectangle around two sides of a cabinet lies
-# along its diagonal; the one whose sides are nearest to the points does not.
-_HEADINGS = 0.5 * math.pi * np.arange(45) / 45
+# Headings of a box, over 90 degrees, about up from the first of `horizontal_axes`. The smallest
+# rectangle around two sides of a cabinet lies along its diagonal; the one whose sides are nearest
+# to the points does not.
+HEADINGS = 45
+_HEADINGS = 0.5 * math.pi * np.arange(HEADINGS) / HEADINGS
 _COSINES = np.array([math.cos(heading) for heading in _HEADINGS])
 _SINES = np.array([math.sin(heading) for heading in _HEADINGS])
 # Bounds of all headings, in whole cache lines: across lines, they take up to twice the time.
@@ -68,6 +47,9 @@ ALIGNED_HEADINGS = 48
 # With 256, ten of 154 boxes lose a part that few views show. Without images, which tell the points
 # of other objects apart, that many are enough.
 MOST_POINTS, FEWER_POINTS = 512, 256
+# A box has the heading of its room unless its points are nearer to the sides of another one, on
+# average, by more than their noise: plates have no heading, books and clocks have few points.
+CLEARER_M = 0.006
 # The up of the world frame if nothing tells it (REP 103).
 DEFAULT_UP = (0.0, 0.0, 1.0)
 # Points that spread less are at one place: the number of buckets for each metre stays finite.
@@ -90,11 +72,15 @@ class Extent(NamedTuple):
         mean_m: (3,) and
         covariance_m2: (9,); see `even_moments`.
         box: without outliers.
+        side_m: the longer one of the footprint whose sides are nearest to the points, and
+        step: its heading, in `HEADINGS`: the box may have that of the room.
     """
 
     mean_m: list[float]
     covariance_m2: list[float]
     box: wire.GravityBox
+    side_m: float
+    step: int
 
 
 def extents_of(
@@ -103,6 +89,7 @@ def extents_of(
     rows: Int64,
     up: Sequence[float],
     shown: Bool | None = None,
+    room_step: int | None = None,
 ) -> list[Extent]:
     """Extents of the surfaces of some rows.
 
@@ -113,22 +100,32 @@ def extents_of(
         up: unit vector against gravity.
         shown: (n, K) bool, points that the images show as the node's. The boxes are around these;
             None = not known.
+        room_step: heading of the room, in `HEADINGS`: boxes whose points tell no other one have
+            it. None = not known.
     """
-    frame, measured = _frame_of(tuple(up)), np.empty((len(rows), 22))
+    step, clearer_m = (0, 0.0) if room_step is None or shown is None else (room_step, CLEARER_M)
+    frame, measured = _frame_of(tuple(up), step), np.empty((len(rows), 24))
     for index, (row, count) in enumerate(zip(rows.tolist(), counts[rows].tolist())):
         columns, result = _columns(points_world[row, :count]), measured[index]
         _even_moments(columns, result[:12])
         if shown is not None and shown[index, :count].sum() >= MIN_SHOWN_POINTS:
             columns = np.ascontiguousarray(columns[:, shown[index, :count]])
-        _box_around(columns, *frame, shown is None, result[12:])
+        _box_around(columns, *frame, shown is None, clearer_m, result[12:])
+    sides_m, turns = measured[:, 22].tolist(), measured[:, 23].astype(np.int64)
+    steps = ((turns + step) % HEADINGS).tolist()
     return [
-        Extent(row[:3], row[3:12], wire.GravityBox(row[12:15], row[15:18], row[18:]))
-        for row in _rounded(measured).tolist()
+        Extent(row[:3], row[3:12], wire.GravityBox(row[12:15], row[15:18], row[18:]), *own)
+        for row, *own in zip(_rounded(measured[:, :22]).tolist(), sides_m, steps)
     ]
 
 
 def _box_around(
-    columns: Float64, axes: Float64, quat_axes: Float64, is_smallest: bool, box: Float64
+    columns: Float64,
+    axes: Float64,
+    quat_axes: Float64,
+    is_smallest: bool,
+    clearer_m: float,
+    box: Float64,
 ) -> None:
     """Write the box around columns (3, n) without outliers, see `_box`.
 
@@ -143,7 +140,7 @@ def _box_around(
     upright = upright[:, squared <= limit]
     if not is_smallest:
         upright = upright[:, _in_main_parts(np.ascontiguousarray(upright))]
-    _box(np.ascontiguousarray(upright), axes, quat_axes, is_smallest, box)
+    _box(np.ascontiguousarray(upright), axes, quat_axes, is_smallest, clearer_m, box)
 
 
 def rounded_gaussians(means: Float64, covariances: Float64, rows: Int64) -> list[list[float]]:
@@ -187,12 +184,12 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
         ValueError: without points, or for one that is not finite or out of reach.
     """
     _check_points(points_world)
-    box = np.empty(10)
-    _box_around(_columns(points_world), *_frame_of(tuple(up)), True, box)
+    box = np.empty(12)
+    _box_around(_columns(points_world), *_frame_of(tuple(up), 0), True, 0.0, box)
     return wire.GravityBox(
         rounded(box[:3], BOX_DECIMALS),
         rounded(box[3:6], BOX_DECIMALS),
-        rounded(box[6:], QUATERNION_DECIMALS),
+        rounded(box[6:10], QUATERNION_DECIMALS),
     )
 
 
@@ -219,17 +216,15 @@ def horizontal_axes(up: Sequence[float]) -> Float64:
 
 
 @lru_cache(maxsize=4)
-def _frame_of(up: tuple[float, ...]) -> tuple[Float64, Float64]:
-    """`horizontal_axes`, and their quaternion: every box needs them, and up changes seldom."""
+def _frame_of(up: tuple[float, ...], step: int) -> tuple[Float64, Float64]:
+    """`horizontal_axes` turned to a heading, and their quaternion: both change seldom."""
     axes = horizontal_axes(up)
+    if step:
+        turn_rad = _HEADINGS[step] - (0.5 * math.pi if step > HEADINGS // 2 else 0.0)
+        cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+        axes = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ axes
     # A column of eigenvectors has another layout than its opposite: one kernel is enough.
     return axes, np.ascontiguousarray(quaternion_from_rotation(axes.T))
-
-
-@lru_cache(maxsize=1024)
-def _axes_of(orientation_xyzw: tuple[float, ...]) -> Float64:
-    """The axes (3, 3) of a box, one a row: most boxes are asked for again as they are."""
-    return pose_from_quaternion(np.zeros(3), np.array(orientation_xyzw))[:3, :3].T
 
 
 def rounded(values: Float64, decimals: int) -> list[float]:
@@ -253,226 +248,6 @@ def surface_points(node: wire.NodeState) -> Float64:
         return np.asarray(offsets * 1e-3 + np.array(node.mean_m))
     points = node.surface_points_m if isinstance(node.surface_points_m, list) else []
     return np.array(points, np.float64).reshape(-1, 3)
-
-
-# --- The boxes of nodes: which of their sides end where they say.
-#
-# A side of a box ends where a view shows what is beyond. The object may go on if the border of the
-# image cuts it, if something is before it, or if it is behind the object itself.
-
-# Which surface points (n, K) the images show as those of n slots; None = not known.
-ShownSurfaces = Callable[[Int64], Bool | None]
-# The two ends of an axis.
-_SIGNS = np.array([-1.0, 1.0])
-# The box of a node is measured again after this fraction of its frames more, within these limits.
-AGAIN_FRACTION, LEAST_FRAMES, MOST_FRAMES = 0.5, 4, 32
-
-
-@dataclass
-class _Ends:
-    """A box, and the frames that show where it ends.
-
-    Attributes:
-        center: (3,), half: (3,) metres; axes: (3, 3) rows.
-        counts: (3, 2, 3), by axis and end: frames that show what is beyond, that do not, and in
-            which the object goes on.
-        due: number of observations of the node from which on it is measured again.
-        rests_m: heights along the third axis, from the origin, of what frames show just below.
-    """
-
-    center: Float64
-    half: Float64
-    axes: Float64
-    counts: Int64
-    due: int = 0
-    rests_m: tuple[float, ...] = ()
-
-    @classmethod
-    def of(cls, box: wire.GravityBox) -> _Ends:
-        """Those of a new box."""
-        axes = _axes_of(tuple(box.orientation_xyzw))
-        half = np.array(box.size_m) / 2.0
-        return cls(np.array(box.center_m), half, axes, np.zeros((3, 2, 3), np.int64))
-
-    def on_its_rest(self, box: wire.GravityBox) -> wire.GravityBox:
-        """A box of the node down to what it rests on; as it is if that is not known or not near."""
-        if len(self.rests_m) < MIN_RESTS:
-            return box
-        center, size = np.array(box.center_m), list(box.size_m)
-        rest_m = sorted(self.rests_m)[len(self.rests_m) // 2]
-        gap_m = round(float(self.axes[2] @ center) - size[2] / 2 - rest_m, BOX_DECIMALS)
-        if not 0 < gap_m <= BEYOND_M:
-            return box
-        center -= 0.5 * gap_m * self.axes[2]
-        size[2] = round(size[2] + gap_m, BOX_DECIMALS)
-        center_m = rounded(center, POSITION_DECIMALS)
-        return msgspec.structs.replace(box, center_m=center_m, size_m=size)
-
-    def shared(self, other: _Ends) -> Bool:
-        """Which ends (3, 2) of another box are those of this one, too."""
-        apart = np.abs(self.axes @ (self.center - other.center))[:, None]
-        apart = apart * [1.0, 1.0] + np.abs(self.half - other.half)[:, None]
-        same = (self.axes * other.axes).sum(axis=1) > SAME_COS
-        return np.asarray((apart < END_M) & same[:, None])
-
-
-class NodeBoxes:
-    """Measures the boxes of nodes, and follows where they end.
-
-    Args:
-        nodes: of the graph.
-        shown: of their surfaces; None = boxes are around all points.
-    """
-
-    def __init__(self, nodes: NodeTable, shown: ShownSurfaces | None = None) -> None:
-        self._nodes = nodes
-        self._shown = shown
-        self._ends: dict[int, _Ends] = {}
-
-    def extents(self, slots: Int64, up: Sequence[float]) -> list[Extent]:
-        """Extents of the surfaces of some slots, which have points."""
-        nodes, shown = self._nodes, None if self._shown is None else self._shown(slots)
-        return extents_of(nodes.surface_points_world, nodes.surface_counts, slots, up, shown)
-
-    def move(self, node_ids: Sequence[int], T_new_old: Float64) -> None:
-        """Move the ends of boxes with their nodes, each by a rigid transform (n, 4, 4)."""
-        for node_id, T in zip(node_ids, T_new_old):
-            if (ends := self._ends.get(node_id)) is not None:
-                height_m = ends.axes[2] @ ends.center
-                ends.center = T[:3, :3] @ ends.center + T[:3, 3]
-                ends.axes = ends.axes @ T[:3, :3].T
-                risen_m = float(ends.axes[2] @ ends.center - height_m)
-                ends.rests_m = tuple(rest_m + risen_m for rest_m in ends.rests_m)
-
-    def followed(self, node_id: int, box: wire.GravityBox) -> wire.GravityBox:
-        """The box of a node, down to what it rests on, with the sides that may go on."""
-        known, sides = self._ends.get(node_id), UNSET
-        if known is not None:
-            seen, cut, on = known.counts.transpose(2, 0, 1)
-            open_ = (cut >= MIN_CUT) & (seen <= MAX_SEEN * (seen + cut))
-            open_ |= (on >= MIN_CUT) & (on >= seen)
-            if open_.any():
-                open_ &= known.shared(_Ends.of(box))
-            if open_.any():
-                sides = open_.any(axis=1).tolist()
-        if sides != box.at_least:
-            box = msgspec.structs.replace(box, at_least=sides)
-        return box if known is None else known.on_its_rest(box)
-
-    def observe(
-        self, local: LocalGraph, node_ids: Sequence[int], up_world: Callable[[], Float64]
-    ) -> None:
-        """Take in what a merged frame shows of the published nodes of its rows.
-
-        `up_world` estimates the direction against gravity (3,), where boxes are measured.
-        """
-        self._measure(node_ids, up_world)
-        rows = [row for row, node_id in enumerate(node_ids) if node_id in self._ends]
-        grid = local.depth_grid
-        if grid is None or grid.instances is None or not grid.depth_mm.size or not rows:
-            return
-        known = [self._ends[node_ids[row]] for row in rows]
-        surfaces = [local.surface_points_world[row] for row in rows]
-        of = np.repeat(np.arange(len(rows)), [len(points) for points in surfaces])
-        points = np.concatenate(surfaces).astype(np.float64)
-        axes = np.array([ends.axes for ends in known])[of]
-        half = np.array([ends.half for ends in known])[of]
-        along = points - np.array([ends.center for ends in known])[of]
-        along = (axes * along[:, None]).sum(axis=2)
-        inside = (np.abs(along) <= half + AROUND_M).all(axis=1)
-        near = half[:, :, None] - along[:, :, None] * _SIGNS < END_M
-        places, sides, at = np.nonzero(near & inside[:, None, None])
-        beyond = points[places] + BEYOND_M * _SIGNS[at, None] * axes[places, sides]
-        bears = (sides == 2) & (at == 0)
-        values = local.instance_ids[rows][of[places]]
-        *seen, way = _seen_beyond(local, grid, points[places], beyond, bears, values)
-        size = 6 * len(rows)
-        cells = 6 * of[places] + 2 * sides + at
-        total = np.maximum(np.bincount(cells, minlength=size), 1)
-        parts = [np.bincount(cells, kind, size) >= SEEN_FRACTION * total for kind in seen]
-        shown, cut, goes_on = np.reshape(parts, (3, len(rows), 3, 2))
-        for ends, *kinds in zip(known, shown & ~goes_on, cut & ~shown & ~goes_on, goes_on):
-            ends.counts += np.stack(kinds, axis=2)
-        # Where the rays to the places below the objects end, above the origin.
-        below = bears & seen[0]
-        camera = local.T_world_camera[:3, 3]
-        ends_at = camera + way[below, None] * (beyond[below] - camera)
-        up = axes[places[below], 2]
-        heights_m = (up * ends_at).sum(axis=1)
-        drops_m = (up * points[places[below]]).sum(axis=1) - heights_m
-        near_below = (drops_m > -BEFORE_M) & (drops_m <= BEYOND_M)
-        rows_below, heights_m = of[places[below]][near_below], heights_m[near_below]
-        for row in np.flatnonzero(np.bincount(rows_below, minlength=1) >= MIN_BELOW):
-            beneath = np.sort(heights_m[rows_below == row])  # np.median takes ten times as long
-            rest_m = float(beneath[len(beneath) // 2])
-            known[row].rests_m = (*known[row].rests_m, rest_m)[-RESTS:]
-
-    def _measure(self, node_ids: Sequence[int], up_world: Callable[[], Float64]) -> None:
-        """Measure the boxes of nodes anew that have been observed often enough since."""
-        nodes, due = self._nodes, []
-        for node_id in node_ids:
-            slot = nodes.slot_of.get(node_id, -1)
-            if slot < 0 or not nodes.confirmed[slot] or not nodes.surface_counts[slot]:
-                continue
-            known = self._ends.get(node_id)
-            if known is None or nodes.observations[slot] >= known.due:
-                due.append(slot)
-        if not due:
-            return
-        slots = np.unique(due)
-        up = tuple(rounded(up_world(), POSITION_DECIMALS))
-        for slot, extent in zip(slots.tolist(), self.extents(slots, up)):
-            ends, node_id = _Ends.of(extent.box), int(nodes.ids[slot])
-            known, count = self._ends.get(node_id), int(nodes.observations[slot])
-            if known is not None:
-                shared = known.shared(ends)
-                ends.counts = known.counts * shared[:, :, None]
-                ends.rests_m = known.rests_m if shared[2, 0] else ()
-            wait = min(max(int(AGAIN_FRACTION * count), LEAST_FRAMES), MOST_FRAMES)
-            ends.due, self._ends[node_id] = count + wait, ends
-        if len(self._ends) > 2 * len(nodes) + FEW_POINTS:
-            self._ends = {i: ends for i, ends in self._ends.items() if i in nodes}
-
-
-def _seen_beyond(
-    local: LocalGraph,
-    grid: DepthGrid,
-    points: Float64,
-    beyond: Float64,
-    bears: Bool,
-    values: Int64,
-) -> tuple[Bool, Bool, Bool, Float64]:
-    """Whether a frame shows what is beyond points (n, 3), hides it, or shows more of the object.
-
-    Each (n,) bool. None of them: there is no depth, or the object before or behind. The last (n,)
-    is what the depth image shows there: its distance, as a part of that of the place beyond.
-
-    Args:
-        local: the frame, and
-        grid: its depth grid, with instances.
-        points: of objects.
-        beyond: (n, 3) points beyond these.
-        bears: (n,) bool, whether a surface between both bears the object, and hides nothing.
-        values: (n,) of the objects in the instances.
-    """
-    T, camera, per_px = invert_pose(local.T_world_camera), grid.intrinsics, 1.0 / grid.stride_px
-    x, y, z = T[:3, :3] @ beyond.T + T[:3, 3:]
-    own_z = T[2, :3] @ points.T + T[2, 3]
-    ahead = np.maximum(z, 1e-3)
-    rows = np.floor((camera.fy * y / ahead + camera.cy) * per_px)
-    columns = np.floor((camera.fx * x / ahead + camera.cx) * per_px)
-    height, width = grid.depth_mm.shape
-    inside = (z > 1e-3) & (rows >= 0) & (columns >= 0) & (rows < height) & (columns < width)
-    at = np.where(inside, rows, 0).astype(np.int64), np.where(inside, columns, 0).astype(np.int64)
-    depth_m = 0.001 * grid.depth_mm[at]
-    limit_m = np.where(bears, np.minimum(own_z, z), z) - BEFORE_M - BEFORE_FRACTION * ahead
-    hidden, known = depth_m < limit_m, depth_m > 0
-    assert grid.instances is not None
-    shown = inside & known & ~hidden & (grid.instances[at] != values)
-    own = inside & known & (grid.instances[at] == values)
-    own &= np.abs(depth_m - z) <= BEFORE_M + BEFORE_FRACTION * ahead
-    cut = ~inside | (known & hidden)
-    return np.asarray(shown), np.asarray(cut), np.asarray(own), np.asarray(depth_m / ahead)
 
 
 @kernel
@@ -623,45 +398,61 @@ def _in_main_parts(upright: Float64) -> Bool:
 
 @kernel
 def _box(
-    upright: Float64, axes: Float64, quat_axes: Float64, is_smallest: bool, box: Float64
+    upright: Float64,
+    axes: Float64,
+    quat_axes: Float64,
+    is_smallest: bool,
+    clearer_m: float,
+    box: Float64,
 ) -> None:
     """Write the box around upright points (3, n): centre, size and quaternion, (10,).
 
-    Its footprint is the smallest, or the one whose sides are nearest to the points.
+    Its footprint is the smallest, or the one whose sides are nearest to the points. It lies along
+    the axes unless the points are nearer to another by `clearer_m`. The last two numbers are the
+    longer side of the nearest, and the step of its heading.
     """
     # Vertical bounds, and horizontal ones along the axes of each heading.
     low, high, bounds = np.inf, -np.inf, np.empty((4, ALIGNED_HEADINGS), np.float64)
     lefts, rights, backs, fronts = bounds[0], bounds[1], bounds[2], bounds[3]
-    for step in range(len(_HEADINGS)):
+    for step in range(HEADINGS):
         lefts[step], rights[step], backs[step], fronts[step] = np.inf, -np.inf, np.inf, -np.inf
     for place in range(upright.shape[1]):
         x, y, z = upright[0, place], upright[1, place], upright[2, place]
         low, high = min(low, z), max(high, z)
         # The compiler makes vectors of this.
-        for step in range(len(_HEADINGS)):
+        for step in range(HEADINGS):
             u = _COSINES[step] * x + _SINES[step] * y
             v = _COSINES[step] * y - _SINES[step] * x
             lefts[step], rights[step] = min(lefts[step], u), max(rights[step], u)
             backs[step], fronts[step] = min(backs[step], v), max(fronts[step], v)
     costs = np.zeros(ALIGNED_HEADINGS, np.float64)
-    for step in range(len(_HEADINGS) if is_smallest else 0):
+    for step in range(HEADINGS if is_smallest else 0):
         costs[step] = (rights[step] - lefts[step]) * (fronts[step] - backs[step])
     for place in range(0 if is_smallest else upright.shape[1]):
         x, y = upright[0, place], upright[1, place]
-        for step in range(len(_HEADINGS)):
+        for step in range(HEADINGS):
             u = _COSINES[step] * x + _SINES[step] * y
             v = _COSINES[step] * y - _SINES[step] * x
             apart = min(u - lefts[step], rights[step] - u)
             costs[step] += min(apart, v - backs[step], fronts[step] - v) / upright.shape[1]
     best = 0
-    for step in range(1, len(_HEADINGS)):
-        # Ties go to the axes of the world.
+    for step in range(1, HEADINGS):
+        # Ties go to the axes.
         if costs[step] < costs[best] - 1e-12:
             best = step
+    box[10] = max(rights[best] - lefts[best], fronts[best] - backs[best])
+    box[11] = best
+    if costs[0] <= costs[best] + clearer_m:
+        best = 0
     left, right, back, front = lefts[best], rights[best], backs[best], fronts[best]
+    turn_rad = _HEADINGS[best]
+    if not is_smallest and best > HEADINGS // 2:
+        # The same, a quarter turn back: the sides keep their names if a heading of 0 varies.
+        turn_rad -= 0.5 * math.pi
+        left, right, back, front = -front, -back, left, right
     box[3], box[4], box[5] = right - left, front - back, high - low
     u, v, w = (left + right) / 2, (back + front) / 2, (low + high) / 2
-    cos, sin = _COSINES[best], _SINES[best]
+    cos, sin = math.cos(turn_rad), math.sin(turn_rad)
     for axis in range(3):
         box[axis] = (
             (cos * u - sin * v) * axes[0, axis]
@@ -670,7 +461,7 @@ def _box(
         )
     # The turn about the third axis, after the axes.
     qx, qy, qz, qw = quat_axes[0], quat_axes[1], quat_axes[2], quat_axes[3]
-    cos, sin = math.cos(_HEADINGS[best] / 2), math.sin(_HEADINGS[best] / 2)
+    cos, sin = math.cos(turn_rad / 2), math.sin(turn_rad / 2)
     sign = -1.0 if qw * cos - qz * sin < 0 else 1.0
     box[6], box[7] = sign * (qx * cos + qy * sin), sign * (qy * cos - qx * sin)
     box[8], box[9] = sign * (qz * cos + qw * sin), sign * (qw * cos - qz * sin)

@@ -1,9 +1,12 @@
-"""The messages of the nodes; only those of changed nodes are rebuilt."""
+"""The messages of the nodes, and their boxes; only those of changed nodes are rebuilt."""
 
 from __future__ import annotations
 
+import cmath
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from itertools import islice
 from typing import NamedTuple
 
@@ -13,16 +16,22 @@ from msgspec import UNSET, UnsetType
 
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.graph.extent import (
+    BOX_DECIMALS,
     DEFAULT_UP,
+    FEW_POINTS,
+    HEADINGS,
     POSITION_DECIMALS,
     Extent,
-    NodeBoxes,
+    extents_of,
     rounded,
     rounded_gaussians,
     surface_bytes,
 )
 from deworldsg_ros.graph.graph import GlobalGraph
-from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.graph.nodes import NodeTable
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
+from deworldsg_ros.scene.camera import invert_pose, pose_from_quaternion
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 from deworldsg_ros.wire import messages as wire
 
 # --- Distributions as messages list them: the best labels, the rest, and the entropy.
@@ -130,6 +139,304 @@ def take_first(waiting: dict[int, None], at_most: int | None) -> list[int]:
     return taken
 
 
+# --- The boxes of nodes: which of their sides end where they say.
+#
+# A side of a box ends where a view shows what is beyond. The object may go on if the border of the
+# image cuts it, if something is before it, or if it is behind the object itself.
+
+# Which surface points (n, K) the images show as those of n slots; None = not known.
+ShownSurfaces = Callable[[Int64], Bool | None]
+# The two ends of an axis.
+_SIGNS = np.array([-1.0, 1.0])
+# A frame shows where a side of a box ends if it shows what is beyond this fraction at least of the
+# points so near its end: what is so far beyond them is in the image, and nothing is before it by
+# the noise of a camera.
+END_M, BEYOND_M = 0.04, 0.06
+SEEN_FRACTION = 0.3
+BEFORE_M, BEFORE_FRACTION = 0.03, 0.01
+# Points are of a box up to this distance from it.
+AROUND_M = 0.02
+# Ends of two boxes are the same within `END_M` if their axes are within this.
+SAME_COS = math.cos(math.radians(15.0))
+# A side may go on if at least MIN_CUT frames do not show its end, and at most MAX_SEEN of all do:
+# masks and depth are wrong in some. It may also go on if as many frames show the object beyond it
+# as show something else there, or if no frame shows this end and MIN_ELSEWHERE show another one.
+MIN_CUT, MAX_SEEN, MIN_ELSEWHERE = 2, 0.1, 5
+# An object rests on what at least MIN_RESTS of the last RESTS frames show, less than `BEYOND_M`
+# below its points: masks end a little above. A frame counts if it shows it below at least MIN_BELOW
+# points.
+MIN_RESTS, RESTS, MIN_BELOW = 3, 9, 3
+# An object that is seen all around hangs if so many frames show that it ends there, above nothing
+# near: then it goes on below, like a chair of which masks have the seat alone.
+MIN_HANGING = 4
+# The heading of a room is that of most objects with a side so long, if their headings agree so
+# much: 1 is all of them.
+MIN_VOTING_M, MIN_VOTES, MIN_AGREEMENT = 0.4, 3, 0.5
+# The box of a node is measured again after this fraction of its frames more, within these limits.
+AGAIN_FRACTION, LEAST_FRAMES, MOST_FRAMES = 0.5, 4, 32
+
+
+@lru_cache(maxsize=1024)
+def _axes_of(orientation_xyzw: tuple[float, ...]) -> Float64:
+    """The axes (3, 3) of a box, one a row: most boxes are asked for again as they are."""
+    return pose_from_quaternion(np.zeros(3), np.array(orientation_xyzw))[:3, :3].T
+
+
+@dataclass
+class Ends:
+    """A box, and the frames that show where it ends.
+
+    Attributes:
+        center: (3,), half: (3,) metres; axes: (3, 3) rows.
+        counts: (3, 2, 3), by axis and end: frames that show what is beyond, that do not, and in
+            which the object goes on.
+        due: number of observations of the node from which on it is measured again.
+        rests_m: heights along the third axis, from the origin, of what frames show just below.
+    """
+
+    center: Float64
+    half: Float64
+    axes: Float64
+    counts: Int64
+    due: int = 0
+    rests_m: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, box: wire.GravityBox) -> Ends:
+        """Those of a new box."""
+        axes = _axes_of(tuple(box.orientation_xyzw))
+        half = np.array(box.size_m) / 2.0
+        return cls(np.array(box.center_m), half, axes, np.zeros((3, 2, 3), np.int64))
+
+    def on_its_rest(self, box: wire.GravityBox) -> wire.GravityBox:
+        """A box of the node down to what it rests on; as it is if that is not known or not near."""
+        if len(self.rests_m) < MIN_RESTS:
+            return box
+        center, size = np.array(box.center_m), list(box.size_m)
+        rest_m = sorted(self.rests_m)[len(self.rests_m) // 2]
+        gap_m = round(float(self.axes[2] @ center) - size[2] / 2 - rest_m, BOX_DECIMALS)
+        if not 0 < gap_m <= BEYOND_M:
+            return box
+        center -= 0.5 * gap_m * self.axes[2]
+        size[2] = round(size[2] + gap_m, BOX_DECIMALS)
+        center_m = rounded(center, POSITION_DECIMALS)
+        return msgspec.structs.replace(box, center_m=center_m, size_m=size)
+
+    def open_sides(self, box: wire.GravityBox) -> list[bool] | UnsetType:
+        """Which sides (3,) of a box of the node may go on; none if that is UNSET."""
+        other = Ends.of(box)
+        same, shared = self.same_axes(other), self.shared(other)
+        seen, cut, on = (self.counts * shared[:, :, None]).transpose(2, 0, 1)
+        open_ = (cut >= MIN_CUT) & (seen <= MAX_SEEN * (seen + cut))
+        open_ |= (on >= MIN_CUT) & (on >= seen)
+        open_ |= same[:, None] & (seen == 0) & (self.counts[..., 0].max() >= MIN_ELSEWHERE)
+        # Nothing hangs in the air, but for what is fixed to a wall, which hides its back.
+        hangs = len(self.rests_m) < MIN_RESTS and seen[2, 0] >= MIN_HANGING
+        open_[2, 0] |= hangs and (seen[:2] >= cut[:2]).all()
+        sides: list[bool] = open_.any(axis=1).tolist()
+        return sides if any(sides) else UNSET
+
+    def same_axes(self, other: Ends) -> Bool:
+        """Which axes (3,) of another box are about those of this one."""
+        return np.asarray((self.axes * other.axes).sum(axis=1) > SAME_COS)
+
+    def shared(self, other: Ends) -> Bool:
+        """Which ends (3, 2) of another box are those of this one, too."""
+        apart = np.abs(self.axes @ (self.center - other.center))[:, None]
+        apart = apart * [1.0, 1.0] + np.abs(self.half - other.half)[:, None]
+        return np.asarray((apart < END_M) & self.same_axes(other)[:, None])
+
+
+class NodeBoxes:
+    """Measures the boxes of nodes, and follows where they end.
+
+    Args:
+        nodes: of the graph.
+        shown: of their surfaces; None = boxes are around all points.
+    """
+
+    def __init__(self, nodes: NodeTable, shown: ShownSurfaces | None = None) -> None:
+        self._nodes = nodes
+        self._shown = shown
+        self._ends: dict[int, Ends] = {}
+        # Of the nodes that vote for the heading of the room: the long side, turned by four times
+        # its heading, so that quarter turns are the same.
+        self._votes: dict[int, complex] = {}
+        # Of all votes, and what it would be if all were the same.
+        self._sum, self._most = 0j, 0.0
+
+    @property
+    def room_step(self) -> int | None:
+        """Heading of the room, in `HEADINGS`, which boxes prefer; None = not known."""
+        if len(self._votes) < MIN_VOTES or abs(self._sum) < MIN_AGREEMENT * self._most:
+            return None
+        return round(cmath.phase(self._sum) / (2.0 * math.pi) * HEADINGS) % HEADINGS
+
+    def extents(self, slots: Int64, up: Sequence[float]) -> list[Extent]:
+        """Extents of the surfaces of some slots, which have points.
+
+        They may change the heading of the room.
+        """
+        nodes, shown = self._nodes, None if self._shown is None else self._shown(slots)
+        known = nodes.surface_points_world, nodes.surface_counts, slots, up, shown
+        before = self.room_step
+        found = extents_of(*known, before)
+        if shown is None:
+            return found
+        for node_id, extent in zip(nodes.ids[slots].tolist(), found):
+            vote = cmath.rect(extent.side_m, 2.0 * math.pi * extent.step / HEADINGS)
+            self._vote(node_id, vote if extent.side_m >= MIN_VOTING_M else 0j)
+        if self.room_step == before:
+            return found
+        for ends in self._ends.values():
+            ends.due = 0
+        return extents_of(*known, self.room_step)
+
+    def forget(self, node_ids: Iterable[int]) -> None:
+        """Nodes that are gone have no say in the heading of the room."""
+        for node_id in node_ids:
+            self._vote(node_id, 0j)
+
+    def _vote(self, node_id: int, vote: complex) -> None:
+        old = self._votes.pop(node_id, 0j)
+        if vote:
+            self._votes[node_id] = vote
+        self._sum, self._most = self._sum + vote - old, self._most + abs(vote) - abs(old)
+
+    def move(self, node_ids: Sequence[int], T_new_old: Float64) -> None:
+        """Move the ends of boxes with their nodes, each by a rigid transform (n, 4, 4)."""
+        for node_id, T in zip(node_ids, T_new_old):
+            if (ends := self._ends.get(node_id)) is not None:
+                height_m = ends.axes[2] @ ends.center
+                ends.center = T[:3, :3] @ ends.center + T[:3, 3]
+                ends.axes = ends.axes @ T[:3, :3].T
+                risen_m = float(ends.axes[2] @ ends.center - height_m)
+                ends.rests_m = tuple(rest_m + risen_m for rest_m in ends.rests_m)
+
+    def followed(self, node_id: int, box: wire.GravityBox) -> wire.GravityBox:
+        """The box of a node, down to what it rests on, with the sides that may go on."""
+        known = self._ends.get(node_id)
+        sides = UNSET if known is None else known.open_sides(box)
+        if sides != box.at_least:
+            box = msgspec.structs.replace(box, at_least=sides)
+        return box if known is None else known.on_its_rest(box)
+
+    def observe(
+        self, local: LocalGraph, node_ids: Sequence[int], up_world: Callable[[], Float64]
+    ) -> None:
+        """Take in what a merged frame shows of the published nodes of its rows.
+
+        `up_world` estimates the direction against gravity (3,), where boxes are measured.
+        """
+        self._measure(node_ids, up_world)
+        rows = [row for row, node_id in enumerate(node_ids) if node_id in self._ends]
+        grid = local.depth_grid
+        if grid is None or grid.instances is None or not grid.depth_mm.size or not rows:
+            return
+        known = [self._ends[node_ids[row]] for row in rows]
+        surfaces = [local.surface_points_world[row] for row in rows]
+        of = np.repeat(np.arange(len(rows)), [len(points) for points in surfaces])
+        points = np.concatenate(surfaces).astype(np.float64)
+        axes = np.array([ends.axes for ends in known])[of]
+        half = np.array([ends.half for ends in known])[of]
+        along = points - np.array([ends.center for ends in known])[of]
+        along = (axes * along[:, None]).sum(axis=2)
+        inside = (np.abs(along) <= half + AROUND_M).all(axis=1)
+        near = half[:, :, None] - along[:, :, None] * _SIGNS < END_M
+        places, sides, at = np.nonzero(near & inside[:, None, None])
+        beyond = points[places] + BEYOND_M * _SIGNS[at, None] * axes[places, sides]
+        bears = (sides == 2) & (at == 0)
+        values = local.instance_ids[rows][of[places]]
+        *seen, way = _seen_beyond(local, grid, points[places], beyond, bears, values)
+        size = 6 * len(rows)
+        cells = 6 * of[places] + 2 * sides + at
+        total = np.maximum(np.bincount(cells, minlength=size), 1)
+        parts = [np.bincount(cells, kind, size) >= SEEN_FRACTION * total for kind in seen]
+        shown, cut, goes_on = np.reshape(parts, (3, len(rows), 3, 2))
+        for ends, *kinds in zip(known, shown & ~goes_on, cut & ~shown & ~goes_on, goes_on):
+            ends.counts += np.stack(kinds, axis=2)
+        # Where the rays to the places below the objects end, above the origin.
+        below = bears & seen[0]
+        camera = local.T_world_camera[:3, 3]
+        ends_at = camera + way[below, None] * (beyond[below] - camera)
+        up = axes[places[below], 2]
+        heights_m = (up * ends_at).sum(axis=1)
+        drops_m = (up * points[places[below]]).sum(axis=1) - heights_m
+        near_below = (drops_m > -BEFORE_M) & (drops_m <= BEYOND_M)
+        rows_below, heights_m = of[places[below]][near_below], heights_m[near_below]
+        for row in np.flatnonzero(np.bincount(rows_below, minlength=1) >= MIN_BELOW):
+            beneath = np.sort(heights_m[rows_below == row])  # np.median takes ten times as long
+            rest_m = float(beneath[len(beneath) // 2])
+            known[row].rests_m = (*known[row].rests_m, rest_m)[-RESTS:]
+
+    def _measure(self, node_ids: Sequence[int], up_world: Callable[[], Float64]) -> None:
+        """Measure the boxes of nodes anew that have been observed often enough since."""
+        nodes, due = self._nodes, []
+        for node_id in node_ids:
+            slot = nodes.slot_of.get(node_id, -1)
+            if slot < 0 or not nodes.confirmed[slot] or not nodes.surface_counts[slot]:
+                continue
+            known = self._ends.get(node_id)
+            if known is None or nodes.observations[slot] >= known.due:
+                due.append(slot)
+        if not due:
+            return
+        slots = np.unique(due)
+        up = tuple(rounded(up_world(), POSITION_DECIMALS))
+        for slot, extent in zip(slots.tolist(), self.extents(slots, up)):
+            ends, node_id = Ends.of(extent.box), int(nodes.ids[slot])
+            known, count = self._ends.get(node_id), int(nodes.observations[slot])
+            if known is not None:
+                shared = known.shared(ends)
+                ends.counts = known.counts * shared[:, :, None]
+                ends.rests_m = known.rests_m if shared[2, 0] else ()
+            wait = min(max(int(AGAIN_FRACTION * count), LEAST_FRAMES), MOST_FRAMES)
+            ends.due, self._ends[node_id] = count + wait, ends
+        if len(self._ends) > 2 * len(nodes) + FEW_POINTS:
+            self._ends = {i: ends for i, ends in self._ends.items() if i in nodes}
+
+
+def _seen_beyond(
+    local: LocalGraph,
+    grid: DepthGrid,
+    points: Float64,
+    beyond: Float64,
+    bears: Bool,
+    values: Int64,
+) -> tuple[Bool, Bool, Bool, Float64]:
+    """Whether a frame shows what is beyond points (n, 3), hides it, or shows more of the object.
+
+    Each (n,) bool. None of them: there is no depth, or the object before or behind. The last (n,)
+    is what the depth image shows there: its distance, as a part of that of the place beyond.
+
+    Args:
+        local: the frame, and
+        grid: its depth grid, with instances.
+        points: of objects.
+        beyond: (n, 3) points beyond these.
+        bears: (n,) bool, whether a surface between both bears the object, and hides nothing.
+        values: (n,) of the objects in the instances.
+    """
+    T, camera, per_px = invert_pose(local.T_world_camera), grid.intrinsics, 1.0 / grid.stride_px
+    x, y, z = T[:3, :3] @ beyond.T + T[:3, 3:]
+    own_z = T[2, :3] @ points.T + T[2, 3]
+    ahead = np.maximum(z, 1e-3)
+    rows = np.floor((camera.fy * y / ahead + camera.cy) * per_px)
+    columns = np.floor((camera.fx * x / ahead + camera.cx) * per_px)
+    height, width = grid.depth_mm.shape
+    inside = (z > 1e-3) & (rows >= 0) & (columns >= 0) & (rows < height) & (columns < width)
+    at = np.where(inside, rows, 0).astype(np.int64), np.where(inside, columns, 0).astype(np.int64)
+    depth_m = 0.001 * grid.depth_mm[at]
+    limit_m = np.where(bears, np.minimum(own_z, z), z) - BEFORE_M - BEFORE_FRACTION * ahead
+    hidden, known = depth_m < limit_m, depth_m > 0
+    assert grid.instances is not None
+    shown = inside & known & ~hidden & (grid.instances[at] != values)
+    own = inside & known & (grid.instances[at] == values)
+    own &= np.abs(depth_m - z) <= BEFORE_M + BEFORE_FRACTION * ahead
+    cut = ~inside | (known & hidden)
+    return np.asarray(shown), np.asarray(cut), np.asarray(own), np.asarray(depth_m / ahead)
+
+
 # --- The messages of the nodes; only those of changed nodes are rebuilt.
 
 # The label of a node without a name that is probable enough.
@@ -176,6 +483,7 @@ class NodeStates:
         self._stale: dict[int, None] = {}
         self.up: tuple[float, ...] = DEFAULT_UP
         self._up_world: Float64 | None = None
+        self._room_step: int | None = None
 
     @property
     def new(self) -> int:
@@ -219,6 +527,7 @@ class NodeStates:
                 self._measured.pop(node_id, None)
                 self._stale.pop(node_id, None)
         self._touched.clear()
+        self._boxes.forget(gone)
         for node_id in take_first(self._new, new_at_most):
             present[node_id] = slot_of[node_id]
         extents = self._measure(present, at_most)
@@ -247,17 +556,23 @@ class NodeStates:
                 due.append(node_id)
             elif known != revisions[slot]:
                 self._stale[node_id] = None
-        due += take_first(self._stale, at_most)
-        if not due:
-            return {}
-        slots = nodes.slots_of(due)
-        self._measured.update(zip(due, revisions[slots].tolist()))
-        solid = nodes.surface_counts[slots] > 0
-        found = iter(self._boxes.extents(slots[solid], self.up))
-        return {
-            node_id: next(found) if has_points else None
-            for node_id, has_points in zip(due, solid.tolist())
-        }
+        extents: dict[int, Extent | None] = {}
+        # All boxes that are measured may tell another heading of the room, and then are again.
+        for _ in range(2 if at_most is None else 1):
+            if self._boxes.room_step != self._room_step:
+                self._room_step = self._boxes.room_step
+                self._stale.update(dict.fromkeys(sorted(self._measured)))
+            due += take_first(self._stale, at_most)
+            if not due:
+                break
+            slots = nodes.slots_of(due)
+            self._measured.update(zip(due, revisions[slots].tolist()))
+            solid = nodes.surface_counts[slots] > 0
+            found = iter(self._boxes.extents(slots[solid], self.up))
+            for node_id, has_points in zip(due, solid.tolist()):
+                extents[node_id] = next(found) if has_points else None
+            due = []
+        return extents
 
     def _make(self, present: Mapping[int, int], extents: Mapping[int, Extent | None]) -> None:
         """Write the messages of nodes, given by id and slot, with a new or the known extent."""
@@ -303,7 +618,7 @@ class NodeStates:
         state = self.states[node_id]
         if state.box is UNSET:
             return None
-        return Extent(state.mean_m, state.covariance_m2, state.box)
+        return Extent(state.mean_m, state.covariance_m2, state.box, 0.0, 0)
 
 
 def _colours(sums: Float64) -> list[list[float] | UnsetType]:

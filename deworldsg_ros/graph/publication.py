@@ -9,9 +9,8 @@ from typing import TypeVar
 import msgspec
 from msgspec import UNSET
 
-from deworldsg_ros.graph.extent import NodeBoxes
 from deworldsg_ros.graph.graph import GlobalGraph
-from deworldsg_ros.graph.messages import NodeStates, some_of
+from deworldsg_ros.graph.messages import NodeBoxes, NodeStates, some_of
 from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.wire import messages as wire

@@ -14,9 +14,8 @@ import numpy as np
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
-from deworldsg_ros.graph.extent import NodeBoxes
 from deworldsg_ros.graph.graph import GlobalGraph
-from deworldsg_ros.graph.messages import NodeStates
+from deworldsg_ros.graph.messages import NodeBoxes, NodeStates
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.editing import (

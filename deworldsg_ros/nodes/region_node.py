@@ -10,8 +10,7 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 
-from deworldsg_ros.client.live import GraphMessage, SceneGraphClient
-from deworldsg_ros.client.region import Region, RegionPart
+from deworldsg_ros.client.live import GraphMessage, Region, RegionPart, SceneGraphClient
 from deworldsg_ros.ros.graph_output import GraphTopics
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import RegionOptions, RegionParameters

@@ -23,6 +23,7 @@ from std_srvs.srv import Trigger
 from deworldsg_ros.base.files import parse_json
 from deworldsg_ros.client.goals import Goal, Robot
 from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.client.next_view import NOTHING
 from deworldsg_ros.client.questions import ask
 from deworldsg_ros.graph.edits import (
     DeleteNode,
@@ -33,6 +34,8 @@ from deworldsg_ros.graph.edits import (
     SplitNode,
     Undo,
 )
+from deworldsg_ros.graph.extent import DEFAULT_UP
+from deworldsg_ros.graph.seen_cells import SeenCells
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map
 from deworldsg_ros.ros.graph_keeper import GraphKeeper
@@ -74,6 +77,19 @@ class GoalNear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     publish: bool = True
 
 
+class LookNext(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The robot, and where it is (absent = where the newest view was taken); see
+    `client.next_view`.
+
+    `publish` false: the pose is only an answer.
+    """
+
+    radius_m: float = Robot.radius_m
+    height_m: float = Robot.height_m
+    start: Point | None = None
+    publish: bool = True
+
+
 class Explain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An object, by id or class, and for a pair a second one; or a class and a place."""
 
@@ -107,6 +123,8 @@ class GraphServices:
         self._node = node
         self._graph = graph
         self._publish_goal = node.create_publisher(PoseStamped, GOAL_TOPIC, reliable(1)).publish
+        # What was seen of the graph of a builder, also by views that it has forgotten.
+        self._seen: tuple[GraphBuilder | None, SeenCells] = (None, SeenCells(DEFAULT_UP))
         self._waiting = 0
         # In their group, no subscription would be served while an answer is awaited.
         self._group = ReentrantCallbackGroup()
@@ -116,6 +134,7 @@ class GraphServices:
         services: Sequence[tuple[str, Any, _Answer]] = (
             ("query", Query, self._query),
             ("goal_near", GoalNear, self._goal_near),
+            ("next_view", LookNext, self._next_view),
             ("explain", Explain, self._explain),
             ("load", Load, self._load),
             ("set_label", SetLabel, self._edit),
@@ -237,6 +256,28 @@ class GraphServices:
             if request.publish:
                 self._publish_goal(goal.pose_stamped())
             return _json(goal.to_dict())
+
+        return answer
+
+    def _next_view(self, request: LookNext) -> Callable[[], str]:
+        graph, builder = self._asked(), self._builder
+        graph.space = copy(builder.space)
+        robot = Robot(request.radius_m, request.height_m)
+        T = builder.T_graph_poses
+        camera = (T[:3, :3] @ builder.trail.camera_world + T[:3, 3]).tolist()
+        x, y, z = camera if request.start is None else request.start
+
+        def answer() -> str:
+            if self._seen[0] is not builder or not self._seen[1].fits(graph.up):
+                self._seen = builder, SeenCells(graph.up)
+            has_views = graph.space is not None and len(graph.space) > 0
+            start = (x, y, z) if has_views or request.start is not None else None
+            found = graph.next_view(robot=robot, start=start, cells=self._seen[1])
+            if found is None:
+                return _json({"pose": None, "reason": NOTHING})
+            if request.publish:
+                self._publish_goal(found.pose_stamped())
+            return _json(found.to_dict())
 
         return answer
 

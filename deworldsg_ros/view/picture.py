@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib import patheffects, rc_context
 from matplotlib.axes import Axes
@@ -21,7 +22,7 @@ from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.objects import SceneObject, scene_object
 from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.scene.arrays import Float64, UInt8, shared_areas
-from deworldsg_ros.scene.camera import pose_from_quaternion
+from deworldsg_ros.scene.camera import RgbdFrame, invert_pose, pose_from_quaternion
 from deworldsg_ros.scene.vocabulary import verb_of
 from deworldsg_ros.view.colours import (
     QUIET,
@@ -497,7 +498,7 @@ def draw(
         path: file to write.
         up_world: (3,) direction that points up in the world frame.
         camera_path_world: (n, 3) positions of the camera, metres; None = not drawn.
-        photos: (s, s, 3) uint8 RGB by id of the node (`photos.photos_of`), for the strip below.
+        photos: (s, s, 3) uint8 RGB by id of the node (`photos_of`), for the strip below.
 
     Raises:
         ValueError: for an up direction of zero length.
@@ -570,3 +571,82 @@ def _draw_arrows(drawing: Drawing) -> None:
                 zorder=5,
             )
         )
+
+
+# --- A photo of each object, cut from frames of the camera.
+
+POINTS_OF_AN_OBJECT = 64
+# A point is seen if the depth image has a surface this close to it, and this part of its distance.
+NEAR_M, NEAR_PART = 0.05, 0.02
+# Of an object that is cut off or covered by more than this, there is no photo.
+LEAST_SEEN = 0.5
+# Around the object, as a part of the photo.
+PHOTO_MARGIN = 0.18
+
+
+def photos_of(
+    graph: wire.SceneGraphMessage, frames: Iterable[RgbdFrame], side_px: int
+) -> dict[int, UInt8]:
+    """The best photo of each object that a frame shows.
+
+    Args:
+        graph: with surface points.
+        frames: in the world frame of the graph.
+        side_px: sides of the photos.
+
+    Returns:
+        (side_px, side_px, 3) uint8 RGB by id of the node. Of an object that no frame shows by at
+        least one half, there is none.
+    """
+    points = {node.id: _sample(surface_points(node)) for node in graph.nodes}
+    best: dict[int, tuple[float, RgbdFrame, Float64]] = {}
+    for frame in frames:
+        for node_id, cloud in points.items():
+            if not len(cloud):
+                continue
+            score, box = _sight(frame, cloud)
+            if score > 0 and (node_id not in best or score > best[node_id][0]):
+                best[node_id] = score, frame, box
+    return {node_id: _cut(frame, box, side_px) for node_id, (_, frame, box) in best.items()}
+
+
+def _sample(points: Float64) -> Float64:
+    return points[:: max(1, len(points) // POINTS_OF_AN_OBJECT)]
+
+
+def _sight(frame: RgbdFrame, points: Float64) -> tuple[float, Float64]:
+    """How well a frame shows an object: 0 = not; and the box x1 y1 x2 y2 around its points."""
+    T = invert_pose(frame.T_world_camera)
+    x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
+    camera = frame.intrinsics
+    is_ahead = z > NEAR_M
+    depth = np.where(is_ahead, z, 1.0)
+    u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
+    inside = is_ahead & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    if inside.mean() < LEAST_SEEN:
+        return 0.0, np.zeros(4)
+    seen_m = frame.depth_m[v[inside].astype(int), u[inside].astype(int)]
+    share = float((np.abs(seen_m - z[inside]) < NEAR_M + NEAR_PART * z[inside]).sum()) / len(points)
+    u, v = u[inside], v[inside]
+    box = np.array([u.min(), v.min(), u.max() + 1, v.max() + 1])
+    if share < LEAST_SEEN:
+        return 0.0, box
+    # More pixels are better, but not if the object is covered.
+    return share**4 * float(np.sqrt((box[2] - box[0]) * (box[3] - box[1]))), box
+
+
+def _cut(frame: RgbdFrame, box: Float64, side_px: int) -> UInt8:
+    """A square around a box, moved into the image; what is still outside is grey."""
+    height, width = frame.rgb.shape[:2]
+    side = int(np.ceil(max(box[2] - box[0], box[3] - box[1]) * (1 + 2 * PHOTO_MARGIN)))
+    middle = np.array([(box[0] + box[2]) / 2, (box[1] + box[3]) / 2])
+    room = np.array([width - side, height - side])
+    low = np.where(room >= 0, np.clip(middle - side / 2, 0, np.maximum(room, 0)), room / 2)
+    x, y = np.round(low).astype(int).tolist()
+    photo = np.full((side, side, 3), 128, np.uint8)
+    rows, columns = slice(max(y, 0), y + side), slice(max(x, 0), x + side)
+    part = frame.rgb[rows, columns]
+    top, left = max(-y, 0), max(-x, 0)
+    photo[top : top + part.shape[0], left : left + part.shape[1]] = part
+    how = cv2.INTER_AREA if side > side_px else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(photo, (side_px, side_px), interpolation=how))

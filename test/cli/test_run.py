@@ -11,11 +11,11 @@ from support.recordings import camera_items, write_bag
 
 from deworldsg_ros import pipeline
 from deworldsg_ros.cli import outputs
+from deworldsg_ros.cli.outputs import Album
 from deworldsg_ros.config import load_config
 from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.relations.world_model import FakeWorldModel
-from deworldsg_ros.view.photos import Album
 from deworldsg_ros.wire import messages as wire
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from support.view import box_at, make_edge, make_graph, make_node, random_graphs, updates_of
 
-from deworldsg_ros.client.region import Region, RegionPart
+from deworldsg_ros.client.live import Region, RegionPart
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import ChangeLog, GraphReplica
 

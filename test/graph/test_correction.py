@@ -2,6 +2,7 @@
 
 import pickle
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -259,8 +260,8 @@ def test_newer_nodes_move_rigidly_and_the_inverse_restores_them(
         return  # some have met
     for node_id, node in states(builder).items():
         known = before[node_id]
-        if node_id in never:
-            assert node == known
+        if node_id in never:  # the heading of the room, which boxes prefer, may be another one
+            assert msgspec.structs.replace(node, box=known.box) == known
         if node_id not in wholly:
             continue
         sigma = T[:3, :3] @ np.reshape(known.covariance_m2, (3, 3)) @ T[:3, :3].T

@@ -1,7 +1,9 @@
 """An operator's edits hold for later frames, and undo brings back what was before."""
 
+import msgspec
 import numpy as np
 import pytest
+from msgspec import UNSET
 from support.merging import VOCABULARY
 from support.surfaces import CHAIR, CUP, HERE, TABLE, frame, slab, view
 
@@ -197,6 +199,15 @@ def test_edits_of_edited_objects_are_undone_newest_first():
         room.builder.edit(Undo())
 
 
+def closed(message: wire.SceneGraphMessage) -> wire.SceneGraphMessage:
+    """Without the sides that may go on: a map does not keep which frames showed their ends."""
+
+    def one(node: wire.NodeState) -> wire.NodeState:
+        return msgspec.structs.replace(node, box=msgspec.structs.replace(node.box, at_least=UNSET))
+
+    return msgspec.structs.replace(message, nodes=[one(node) for node in message.nodes])
+
+
 @pytest.mark.parametrize("frames", [0, 6])
 def test_edits_survive_a_map_and_continue_equally(tmp_path, frames):
     room = Room((LEFT, TABLE), (RIGHT, TABLE), (BESIDE, CUP))
@@ -211,7 +222,7 @@ def test_edits_survive_a_map_and_continue_equally(tmp_path, frames):
     config = Config(output=OutputConfig(min_existence=0.0))
     whole, again = room.builder, read_map(config, first)
     assert copy_state(again).keys() == copy_state(whole).keys()
-    assert again.full() == whole.full()
+    assert closed(again.full()) == closed(whole.full())
     whole.graph.take_removals()
     for stamp in range(room.stamp + 1, room.stamp + 6):
         local = view(stamp, *room.objects)
@@ -220,7 +231,7 @@ def test_edits_survive_a_map_and_continue_equally(tmp_path, frames):
     for builder in (again, whole):
         assert builder.edit(Undo()).text == "undone: delete of 3"
         assert builder.edit(Undo()).nodes == [1, 2]
-    assert again.full().nodes == whole.full().nodes
+    assert closed(again.full()) == closed(whole.full())
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from support.surfaces import CUP, HERE, TABLE, slab, view
 
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import ClientError, SceneGraphClient
+from deworldsg_ros.client import Robot as RobotSize
 from deworldsg_ros.client.mcp_server import EditTools, GraphTools
 from deworldsg_ros.client.questions import ask
 from deworldsg_ros.graph.graph_files import read_graph
@@ -210,6 +211,28 @@ def test_questions_are_answered_and_a_goal_is_published_on_request_only(robot, c
     assert message.pose.position.x == pytest.approx(x_m, abs=1e-3)
 
 
+def test_where_to_look_next_is_answered_and_published_on_request_only(robot, client):
+    goals = robot.peer.listen(PoseStamped, "deworldsg/goal", 1)
+    robot.node.graph.builder.space = seen_room()
+    small = RobotSize(radius_m=0.2, height_m=1.0)
+    found = robot.ask(client.next_view, small, (-0.5, 0.0, 1.2))
+    assert found["reason"] and found["path_m"] >= 0.0 and found["header"]["frame_id"] == "world"
+    agent = GraphTools(lambda: client.graph, client)
+    assert robot.ask(agent.next_view, 0.2, 1.0)["pose"]
+    request = {"radius_m": 0.2, "height_m": 1.0, "start": [-0.5, 0.0, 1.2]}
+    published = robot.ask(client.command, "next_view", **request)
+    assert published == found
+    robot.expect(lambda: bool(goals), "the pose that was to be published")
+    (message,) = goals
+    assert message.pose.position.x == pytest.approx(found["pose"]["position"]["x"], abs=1e-3)
+    refused = robot.call(
+        AddDiagnostics,
+        "/graph_node/next_view",
+        AddDiagnostics.Request(load_namespace='{"start": [99, 0, 0]}'),
+    )
+    assert not refused.success and "beside what is known" in refused.message
+
+
 @pytest.mark.parametrize(
     ("service", "request_", "says"),
     [
@@ -359,13 +382,18 @@ def test_clients_that_followed_another_node_come_back(robot, client):
 def test_the_calls_in_the_documentation_work(robot, root_dir):
     page = (root_dir / "docs" / "on_a_robot.md").read_text(encoding="utf-8")
     calls = [shlex.split(line) for line in page.splitlines() if "service call" in line[:20]]
-    assert len({call[3] for call in calls}) == 11
+    assert len({call[3] for call in calls}) == 12
     kinds = {"std_srvs/srv/Trigger": Trigger, "diagnostic_msgs/srv/AddDiagnostics": AddDiagnostics}
     for _, _, _, topic, name, *values in calls:
         request = kinds[name].Request(**(yaml.safe_load(values[0]) if values else {}))
         answer = robot.call(kinds[name], topic, request)
         # The objects of the page are not those of this graph, but it reads the request.
-        others = ("not in the graph", "nothing to undo", "room.map")
+        others = (
+            "not in the graph",
+            "nothing to undo",
+            "room.map",
+            "nothing is known of the space",
+        )
         assert answer.success or any(words in answer.message for words in others), answer.message
 
 

@@ -48,7 +48,7 @@ def imported_modules(root: Path) -> set[str]:
 
 def test_every_imported_library_is_a_requirement(root_dir):
     extras = ("run", "models", "export", "cluster", "mcp", "networkx")
-    extras += ("fleet", "store", "foxglove", "glb")
+    extras += ("fleet", "store", "foxglove", "glb", "physics")
     libraries = {
         DISTRIBUTIONS.get(name, name).lower()
         for name in imported_modules(root_dir) - set(sys.stdlib_module_names)

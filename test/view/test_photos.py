@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from support.view import make_graph, make_node
 
+from deworldsg_ros.cli import outputs
+from deworldsg_ros.cli.outputs import Album
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
-from deworldsg_ros.view import photos, picture
-from deworldsg_ros.view.photos import Album, photos_of
+from deworldsg_ros.view import picture
+from deworldsg_ros.view.picture import photos_of
 
 CAMERA = Intrinsics(100.0, 100.0, 59.5, 39.5, 120, 80)
 RED, GREEN = (200, 30, 30), (20, 160, 40)
@@ -54,8 +56,8 @@ def test_there_is_no_photo_of_what_no_frame_shows(node, depth_m, x_m):
 
 
 def test_an_album_keeps_evenly_spaced_frames_of_any_length(monkeypatch):
-    monkeypatch.setattr(photos, "LEAST_FRAMES", 8)
-    monkeypatch.setattr(photos, "MOST_BYTES", 0)
+    monkeypatch.setattr(outputs, "LEAST_FRAMES", 8)
+    monkeypatch.setattr(outputs, "MOST_BYTES", 0)
     for count in (3, 8, 9, 100, 1000):
         album, one = Album(), frame()
         for index in range(count):

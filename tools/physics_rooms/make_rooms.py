@@ -35,11 +35,11 @@ from physics_room.files import (
     write_annotations,
     write_ply,
 )
-from physics_room.layout import Room, build_room
+from physics_room.layout import Room
 from physics_room.render import Scene, assemble, render, shell
 from physics_room.sensor import DepthSensor, draw_sensor, sense
 from physics_room.shapes import Item, turn
-from physics_room.simulate import Outcome, simulate
+from physics_room.simulate import Outcome, settled_room
 from physics_room.truth import Judge, relation_rows
 from physics_room.walk import plan
 
@@ -61,30 +61,6 @@ def vocabulary() -> dict[str, list[str]]:
         "VisualGenome_list": list(VISUAL_GENOME_CLASSES),
         "VisualGenome_rel": list(REPLICA_SSG_PREDICATES),
     }
-
-
-def settled_room(index: int, seed: int) -> tuple[Room, Outcome]:
-    """A room at rest. What left the room is taken out, and the rest settles again."""
-    for attempt in range(20):
-        room = build_room(np.random.default_rng([seed, index, attempt]))
-        outcome = simulate(room.items, room.size)
-        gone = {i.number for i in room.items if i.anchor == "free" and _outside(i, room)}
-        if gone:
-            room.items = [
-                i for i in room.items
-                if i.number not in gone and not (i.holder and i.holder.number in gone)
-            ]  # fmt: skip
-            for number, item in enumerate(room.items, start=1):
-                item.number = number
-            outcome = simulate(room.items, room.size)
-        if outcome.resting and sum(i.kind == "small" for i in room.items) >= 12:
-            return room, outcome
-    raise RuntimeError(f"room {index} of seed {seed} never came to rest in 20 attempts")
-
-
-def _outside(item: Item, room: Room) -> bool:
-    limit = np.array(room.size[:2]) / 2 + 0.05
-    return bool(item.position[2] < -0.05 or (np.abs(item.position[:2]) > limit).any())
 
 
 def view_test(scene: Scene):

@@ -18,8 +18,8 @@ from deworldsg_ros.checkpoints.loading import (
     noise_pattern,
     require_finite,
 )
-from deworldsg_ros.client.text_tower import one_tower
 from deworldsg_ros.config import PerceptionConfig
+from deworldsg_ros.graph.embeddings import one_tower
 from deworldsg_ros.perception.backends.image_tensors import Preprocessing
 from deworldsg_ros.scene.arrays import Float32, UInt8
 

@@ -9,8 +9,7 @@ from support.view import SAVED
 
 from deworldsg_ros.client import ClientError, SceneGraph
 from deworldsg_ros.client.questions import ask
-from deworldsg_ros.client.text_tower import embed_text
-from deworldsg_ros.graph.embeddings import Looks
+from deworldsg_ros.graph.embeddings import Looks, embed_text
 from deworldsg_ros.perception import build_perception
 from deworldsg_ros.perception.backends.embedder import ImageEmbedder
 from deworldsg_ros.scene.errors import ConfigurationError

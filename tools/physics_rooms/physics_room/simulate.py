@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from .layout import Room, build_room
 from .shapes import Item
 
 STEP_S = 0.003
@@ -139,7 +140,7 @@ class World:
                 if root in parts:
                     wanted[root].add(parts[root])
         falls: dict[int, set[int]] = {}
-        still = self._moved(set())
+        still = self.moved(set())
         pending = sorted(wanted)
         while pending:
             batch, busy, later = [], set(), []
@@ -149,7 +150,7 @@ class World:
                     continue
                 busy |= wanted[number]
                 batch.append(number)
-            moved = self._moved(set(batch)) - still
+            moved = self.moved(set(batch)) - still
             for number in batch:
                 for other in moved:
                     if other != number and parts.get(other) in wanted[number]:
@@ -199,7 +200,7 @@ class World:
                 group[root(a)] = root(b)
         return {number: root(number) for number in free}
 
-    def _moved(self, removed: set[int]) -> set[int]:
+    def moved(self, removed: set[int]) -> set[int]:
         """Free items that move when some items are not there."""
         model = self.model
         types, affinities = model.geom_contype.copy(), model.geom_conaffinity.copy()
@@ -227,6 +228,30 @@ def simulate(items: list[Item], size: tuple[float, float, float]) -> Outcome:
     resting = world.settle()
     touches = world.touches()
     return Outcome(touches, world.removals(touches), resting)
+
+
+def settled_room(index: int, seed: int) -> tuple[Room, Outcome]:
+    """A room at rest. What left the room is taken out, and the rest settles again."""
+    for attempt in range(20):
+        room = build_room(np.random.default_rng([seed, index, attempt]))
+        outcome = simulate(room.items, room.size)
+        gone = {i.number for i in room.items if i.anchor == "free" and _outside(i, room)}
+        if gone:
+            room.items = [
+                i for i in room.items
+                if i.number not in gone and not (i.holder and i.holder.number in gone)
+            ]  # fmt: skip
+            for number, item in enumerate(room.items, start=1):
+                item.number = number
+            outcome = simulate(room.items, room.size)
+        if outcome.resting and sum(i.kind == "small" for i in room.items) >= 12:
+            return room, outcome
+    raise RuntimeError(f"room {index} of seed {seed} never came to rest in 20 attempts")
+
+
+def _outside(item: Item, room: Room) -> bool:
+    limit = np.array(room.size[:2]) / 2 + 0.05
+    return bool(item.position[2] < -0.05 or (np.abs(item.position[:2]) > limit).any())
 
 
 def _xml(items: list[Item], size: tuple[float, float, float]) -> str:
