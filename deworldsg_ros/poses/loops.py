@@ -301,6 +301,7 @@ class LoopOdometry:
         odometry: from frame to frame.
         closed: number of closed loops.
         correction_m: how far the last one moved the camera.
+        direct: (4, 4) pose of the newest frame from frame to frame, without map and loops.
     """
 
     def __init__(self, T_world_start: Float64 | None = None) -> None:
@@ -310,7 +311,7 @@ class LoopOdometry:
         self._keyframes: list[_Keyframe] = []
         self._loops: list[tuple[_Keyframe, _Keyframe, Float64]] = []
         # Of the last frame: the pose from frame to frame, that in the map, and the restarts so far.
-        self._T_odometry, self._T, self._restarts = np.eye(4), np.eye(4), 0
+        self.direct, self._T, self._restarts = np.eye(4), np.eye(4), 0
         self._since = 0  # the first frame after the last restart
         self._turn = 0
 
@@ -342,7 +343,7 @@ class LoopOdometry:
             self._since = self._map.frame + 1
         last = self._keyframes[-1] if self._keyframes else None
         if last is not None:
-            T = self._fitted(rigid(self._T @ invert_pose(self._T_odometry) @ T_odometry), grid)
+            T = self._fitted(rigid(self._T @ invert_pose(self.direct) @ T_odometry), grid)
         begins = last is None or _is_far(last.T, T, KEYFRAME_M, KEYFRAME_DEG) or restarted
         closing = None
         if begins and (last is None or stamp_ns > last.stamp_ns):
@@ -354,7 +355,7 @@ class LoopOdometry:
             closing = self._look_back(newest, grid)
             T = self._fitted(newest.T, grid)  # what `add` fuses is the active part
         self._map.add(T)
-        self._T_odometry, self._T, self._restarts = T_odometry, T, self.odometry.restarts
+        self.direct, self._T, self._restarts = T_odometry, T, self.odometry.restarts
         return T, closing
 
     def _found_again(self, grid: DepthGrid) -> Float64 | None:
@@ -363,7 +364,7 @@ class LoopOdometry:
             T_seen = self._map.register(T, grid)
             fit = None if T_seen is None else fit_of(self._map.rows[self._map.seen], T_seen, grid)
             if T_seen is not None and fit is not None and fit.is_loop:
-                self._T = self._T_odometry = rigid(T_seen)
+                self._T = self.direct = rigid(T_seen)
                 self.odometry.resume(self._T)
                 self._map.rows[self._map.seen, 7] = self._map.frame
                 return self._T
