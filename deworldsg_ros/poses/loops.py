@@ -329,14 +329,14 @@ class LoopOdometry:
         Raises:
             RefusedInput: as `RgbdOdometry.track`.
         """
-        grid = _grid(depth_m, intrinsics)
+        grid, found = _grid(depth_m, intrinsics), None
         try:
             T_odometry = self.odometry.track(rgb, depth_m, intrinsics)
         except RefusedInput:
             found = self._found_again(grid)
             if found is None:
                 raise
-            T_odometry = found
+            T_odometry = self.direct
         T = T_odometry
         restarted = self.odometry.restarts > self._restarts
         if restarted:  # where this is seen from, nobody knows
@@ -344,12 +344,15 @@ class LoopOdometry:
         last = self._keyframes[-1] if self._keyframes else None
         if last is not None:
             T = self._fitted(rigid(self._T @ invert_pose(self.direct) @ T_odometry), grid)
-        begins = last is None or _is_far(last.T, T, KEYFRAME_M, KEYFRAME_DEG) or restarted
+        begins = last is None or _is_far(last.T, T, KEYFRAME_M, KEYFRAME_DEG)
+        begins |= restarted or found is not None
         closing = None
         if begins and (last is None or stamp_ns > last.stamp_ns):
             newest = _Keyframe(stamp_ns, T, self._map.frame + 1, self.odometry.features, last)
-            newest.loose = RESTARTED if restarted else 1.0
+            newest.loose = RESTARTED if restarted or found is not None else 1.0
             self._keyframes.append(newest)
+            if found is not None:
+                self._loops.append((found, newest, invert_pose(found.T) @ T))
             if len(self._keyframes) > MAX_KEYFRAMES:
                 self._thin()
             closing = self._look_back(newest, grid)
@@ -358,16 +361,17 @@ class LoopOdometry:
         self.direct, self._T, self._restarts = T_odometry, T, self.odometry.restarts
         return T, closing
 
-    def _found_again(self, grid: DepthGrid) -> Float64 | None:
-        """The pose of a lost frame that shows what was seen before; None if it does not."""
+    def _found_again(self, grid: DepthGrid) -> _Keyframe | None:
+        """Go on from a lost frame that shows what was seen before, and from when; None if not."""
         for T in self._recognised(self._T, self._keyframes, True):
             T_seen = self._map.register(T, grid)
             fit = None if T_seen is None else fit_of(self._map.rows[self._map.seen], T_seen, grid)
             if T_seen is not None and fit is not None and fit.is_loop:
                 self._T = self.direct = rigid(T_seen)
                 self.odometry.resume(self._T)
+                row = self._row_of(self._map.seen)
                 self._map.rows[self._map.seen, 7] = self._map.frame
-                return self._T
+                return self._keyframes[row]
         return None
 
     @property
@@ -395,12 +399,16 @@ class LoopOdometry:
             T_seen = self._map.register(T, grid, until=self._active() - 1)
             if T_seen is None:
                 continue
-            seen = self._map.rows[self._map.seen]
-            row = max(bisect_right(self._firsts, float(np.median(seen[:, 7]))) - 1, 0)
+            seen, row = self._map.rows[self._map.seen], self._row_of(self._map.seen)
             fit = fit_of(seen, T_seen, grid) if self._may_be(row, newest.T, T_seen) else None
             if fit is not None and fit.is_loop:
                 return self._close(row, newest, rigid(T_seen))
         return None
+
+    def _row_of(self, seen: Int64) -> int:
+        """The row of the keyframe that most surfels were last seen from, a median."""
+        frame = float(np.median(self._map.rows[seen, 7]))
+        return max(bisect_right(self._firsts, frame) - 1, 0)
 
     @property
     def _firsts(self) -> list[int]:
