@@ -1,13 +1,10 @@
 #!/usr/bin/env python3
-"""Make the moving pictures of the docs from the shipped recording.
+"""Make the moving picture of README: the camera's image beside the graph that grows from it.
 
 python tools/moving_picture.py [OUT.webp]
-python tools/moving_picture.py --loop [OUT.webp]
 
-The first one is that of README: the camera's image beside the graph that grows from it, drawn in
-Chromium (three minutes). The second one is a loop that closes, seen from above: odometry from frame
-to frame, which is not aligned with the map, so that its drift can be seen. A picture has at most
-1.5 MB.
+It runs the shipped recording, and draws the page in Chromium (three minutes). The picture has at
+most 1.5 MB.
 """
 
 from __future__ import annotations
@@ -24,10 +21,8 @@ from PIL import Image
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.pipeline import FrameResult, Pipeline
-from deworldsg_ros.poses import loops
-from deworldsg_ros.poses.loops import LoopOdometry, closings_in_words
 from deworldsg_ros.recordings.recording import open_recording
-from deworldsg_ros.scene.arrays import Float64, UInt8
+from deworldsg_ros.scene.arrays import UInt8
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.view import page
 from deworldsg_ros.view.colours import class_colours, to_rgb
@@ -39,9 +34,6 @@ from support.browser import browser  # noqa: E402
 
 RECORDING = ROOT / "bags" / "demo_room"
 OUT = ROOT / "docs" / "images" / "growing.webp"
-LOOP_OUT = OUT.with_name("loop.webp")
-# The loop: a step every so many frames, and the middle of the picture, y and x in metres.
-LOOP_EVERY, CENTRE_M = 3, (0.0, 1.0)
 EVERY, HEIGHT, STEP_MS, LAST_MS = 9, 480, 450, 3000
 MAX_BYTES = 1_500_000
 
@@ -108,57 +100,12 @@ def drawn(opened: Any, file: Path, script: str) -> tuple[UInt8, Any]:
     return image, value
 
 
-def loop_pictures() -> tuple[list[Image.Image], list[int]]:
-    """The steps of a loop that closes, and how long each is shown."""
-    loops.PRIOR = 1e9
-    odometry, recording = LoopOdometry(), open_recording(RECORDING)
-    steps, durations, path = [], list[int](), np.zeros((0, 4, 4))
-    stamps_ns: list[int] = []
-    for index, frame in enumerate(recording.frames()):
-        T, closing = odometry.track(frame.stamp_ns, frame.rgb, frame.depth_m, frame.intrinsics)
-        if closing is not None:
-            path = closing.at(np.array(stamps_ns)) @ path
-        path = np.append(path, T[None], axis=0)
-        stamps_ns.append(frame.stamp_ns)
-        if index % LOOP_EVERY == 0 or closing is not None:
-            told = closings_in_words(odometry.closed, odometry.correction_m)
-            steps.append(beside(frame.rgb, from_above(odometry.surfels, path, told)))
-            durations.append(1500 if closing is not None else 150)
-    recording.close()
-    return steps, durations
-
-
-def from_above(surfels: Float64, path: Float64, told: str) -> UInt8:
-    """The surfels of walls and furniture, and the path of the camera."""
-    image = np.full((HEIGHT, 640, 3), 255, np.uint8)
-    middle, scale = np.array([320, HEIGHT / 2]), 70.0
-
-    def pixels(points: Float64) -> np.ndarray:
-        return np.rint(middle + scale * (points[:, [1, 0]] - CENTRE_M) * (-1, -1)).astype(int)
-
-    upright = surfels[np.abs(surfels[:, 5]) < 0.5]
-    for x, y in pixels(upright):
-        cv2.circle(image, (int(x), int(y)), 1, (120, 120, 120), -1)
-    places = pixels(path[:, :3, 3])
-    cv2.polylines(image, [places.astype(np.int32)], False, (30, 90, 220), 2, cv2.LINE_AA)
-    cv2.circle(image, [int(v) for v in places[-1]], 6, (220, 60, 30), -1, cv2.LINE_AA)
-    font = cv2.FONT_HERSHEY_SIMPLEX
-    cv2.putText(image, told, (10, HEIGHT - 14), font, 0.55, (0, 0, 0), 1, cv2.LINE_AA)
-    return image
-
-
 def main() -> None:
     """Write the picture."""
-    words = [word for word in sys.argv[1:] if word != "--loop"]
-    if "--loop" in sys.argv:
-        out = Path(words[0]) if words else LOOP_OUT
-        steps, durations = loop_pictures()
-    else:
-        out = Path(words[0]) if words else OUT
-        with tempfile.TemporaryDirectory() as folder:
-            steps = pictures(Path(folder))
-        durations = [STEP_MS] * len(steps)
-    durations[-1] = LAST_MS
+    out = Path(sys.argv[1]) if len(sys.argv) > 1 else OUT
+    with tempfile.TemporaryDirectory() as folder:
+        steps = pictures(Path(folder))
+    durations = [STEP_MS] * (len(steps) - 1) + [LAST_MS]
     for quality in (75, 60, 45, 30):
         content = io.BytesIO()
         steps[0].save(

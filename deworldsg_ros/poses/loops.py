@@ -374,11 +374,6 @@ class LoopOdometry:
                 return self._keyframes[row]
         return None
 
-    @property
-    def surfels(self) -> Float64:
-        """The map (n, 8): position and normal, world frame; frames that saw it, the newest one."""
-        return self._map.rows.copy()
-
     def _active(self) -> int:
         """The first frame of the active part of the map."""
         newest = self._keyframes[-ACTIVE:]
