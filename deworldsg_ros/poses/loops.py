@@ -9,9 +9,6 @@ from itertools import chain
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.linalg import spsolve
-from scipy.spatial.transform import Rotation
 
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.poses.drift import FAR_M, NEAR_M, SurfelMap
@@ -66,6 +63,8 @@ def _residuals(T: Float64, edges: Edges) -> tuple[Float64, Float64, Float64]:
     A residual is the rotation vector and the translation of T_a_b⁻¹ T_a⁻¹ T_b. A pose moves by a
     rotation vector and a translation (6,) in its own axes.
     """
+    from scipy.spatial.transform import Rotation
+
     R_a, R_b, R_z = T[edges.a, :3, :3], T[edges.b, :3, :3], edges.T_a_b[:, :3, :3]
     apart = np.einsum("mji,mj->mi", R_a, T[edges.b, :3, 3] - T[edges.a, :3, 3])
     R_ab, back = R_a.swapaxes(1, 2) @ R_b, R_z.swapaxes(1, 2)
@@ -115,6 +114,11 @@ def solve(T_world: Float64, edges: Edges, kernel: Kernel = "cauchy") -> Float64:
         edges: connect all poses.
         kernel: of the loops.
     """
+    # scipy takes a second to import, and is needed when a loop closes.
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.linalg import spsolve
+    from scipy.spatial.transform import Rotation
+
     T, count = T_world.copy(), len(T_world)
     limit = np.inf
     columns = 6 * np.stack((edges.a, edges.b))[:, :, None] + np.arange(6)
@@ -198,6 +202,8 @@ class Fit(NamedTuple):
         optimization-based state estimation problems", ICRA 2016]. The others are the mean of both
         poses, where T counts as `PRIOR` surfels.
         """
+        from scipy.spatial.transform import Rotation
+
         move = T_fitted @ invert_pose(T)
         turn = self.size_m * Rotation.from_matrix(move[:3, :3]).as_rotvec()
         shift = move[:3, :3] @ self.centre + move[:3, 3] - self.centre
@@ -453,6 +459,8 @@ class LoopOdometry:
         return Trajectory(stamps_ns, after, T_new_old)
 
     def _edges(self) -> Edges:
+        from scipy.spatial.transform import Rotation
+
         row = {id(keyframe): at for at, keyframe in enumerate(self._keyframes)}
         steps = self._keyframes[1:]
         T = np.array([k.T_last for k in steps] + [T for _, _, T in self._loops])
