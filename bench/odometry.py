@@ -2,8 +2,8 @@
 
     python bench/odometry.py RECORDING [--max-frames N]
 
-It compares two methods: colour and depth, and depth alone (the fallback for OpenCV 4). Both process
-each frame, one after the other, so the ratio of their times is paired.
+It compares three trajectories: by odometry from frame to frame, aligned with the map as each frame
+came, and after the loops were closed. All begin at the first true pose.
 """
 
 from __future__ import annotations
@@ -13,61 +13,26 @@ import sys
 import time
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from deworldsg_ros.poses.odometry import RgbdOdometry
+from deworldsg_ros.poses.loops import LoopOdometry, closings_in_words
 from deworldsg_ros.recordings.recording import open_recording
-from deworldsg_ros.scene.camera import RgbdFrame, invert_pose, rotation_angle_deg
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import rotation_angle_deg
 from deworldsg_ros.scene.errors import RefusedInput
 
-Pose = Any
 
-
-class Tracked:
-    """Estimated poses of one method, and the true poses."""
-
-    def __init__(self, method: str, T_world_start: Pose) -> None:
-        self.method = method
-        self.odometry = RgbdOdometry(T_world_start, depth_only=method == "depth")
-        self.pairs: list[tuple[Pose, Pose]] = []
-        self.times_ms: list[float] = []
-
-    def track(self, frame: RgbdFrame) -> None:
-        """Track a frame."""
-        start = time.perf_counter()
-        try:
-            T = self.odometry.track(frame.rgb, frame.depth_m, frame.intrinsics)
-        except RefusedInput:
-            return
-        finally:
-            self.times_ms.append(1e3 * (time.perf_counter() - start))
-        self.pairs.append((frame.T_world_camera, T))
-
-    def report(self) -> None:
-        """Print errors and times."""
-        steps = [
-            invert_pose(invert_pose(a) @ b) @ (invert_pose(x) @ y)
-            for (a, x), (b, y) in zip(self.pairs, self.pairs[1:])
-        ]
-        step_mm = 1e3 * np.array([np.linalg.norm(step[:3, 3]) for step in steps])
-        rotation_deg = np.array([rotation_angle_deg(step[:3, :3]) for step in steps])
-        true = np.array([a[:3, 3] for a, _ in self.pairs])
-        off_m = np.array([np.linalg.norm(a[:3, 3] - x[:3, 3]) for a, x in self.pairs])
-        path_m = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
-        last, estimate = self.pairs[-1]
-        print(
-            f"{self.method:5}: step {np.median(step_mm):.2f} mm (p95 "
-            f"{np.percentile(step_mm, 95):.2f}), {np.median(rotation_deg):.3f} deg; "
-            f"drift "
-            f"{off_m[-1]:.3f} m and {rotation_angle_deg(last[:3, :3].T @ estimate[:3, :3]):.2f} "
-            f"deg after {path_m:.2f} m (maximum {off_m.max():.3f} m); "
-            f"{np.median(self.times_ms):.0f} ms per frame; {self.odometry.lost} lost, "
-            f"{self.odometry.restarts} restarts"
-        )
+def report(name: str, poses: Float64, true: Float64) -> None:
+    """Print the errors of a trajectory (n, 4, 4)."""
+    off_m = np.linalg.norm(poses[:, :3, 3] - true[:, :3, 3], axis=1)
+    turned = [rotation_angle_deg(a[:3, :3].T @ b[:3, :3]) for a, b in zip(poses, true)]
+    print(
+        f"{name:14}: {100 * off_m[-1]:.1f} cm and {turned[-1]:.2f} deg at the end; mean "
+        f"{100 * off_m.mean():.1f} cm, maximum {100 * off_m.max():.1f} cm and {max(turned):.2f} deg"
+    )
 
 
 def main() -> None:
@@ -76,18 +41,37 @@ def main() -> None:
     parser.add_argument("--max-frames", type=int, default=0, help="0 = all")
     options = parser.parse_args()
     recording = open_recording(options.recording)
-    tracked: list[Tracked] = []
-    count = 0
+    odometry: LoopOdometry | None = None
+    stamps_ns, times_ms = list[int](), list[float]()
+    true, direct, mapped = (list[Float64]() for _ in range(3))
+    corrected = np.zeros((0, 4, 4))
     for frame in islice(recording.frames(), options.max_frames or None):
-        count += 1
-        tracked = tracked or [Tracked(m, frame.T_world_camera) for m in ("rgbd", "depth")]
-        for method in tracked:
-            method.track(frame)
-    print(f"{recording.name}, {count} frames")
-    for method in tracked:
-        method.report()
-    a, b = (np.array(method.times_ms[1:]) for method in tracked)
-    print(f"time of rgbd / depth, paired: {np.median(a / b):.2f}")
+        odometry = odometry or LoopOdometry(frame.T_world_camera)
+        start_s = time.process_time()
+        try:
+            T, closing = odometry.track(frame.stamp_ns, frame.rgb, frame.depth_m, frame.intrinsics)
+        except RefusedInput:
+            continue
+        times_ms.append(1e3 * (time.process_time() - start_s))
+        if closing is not None:
+            corrected = closing.at(np.array(stamps_ns)) @ corrected
+        corrected = np.append(corrected, T[None], axis=0)
+        stamps_ns.append(frame.stamp_ns)
+        true.append(frame.T_world_camera)
+        direct.append(odometry.direct)
+        mapped.append(T)
+    assert odometry is not None
+    path_m = np.linalg.norm(np.diff(np.array(true)[:, :3, 3], axis=0), axis=1).sum()
+    tracking = odometry.odometry
+    print(
+        f"{recording.name}, {len(true)} frames, {path_m:.1f} m; {tracking.lost} frames lost, "
+        f"{tracking.restarts} restarts; {closings_in_words(odometry.closed, odometry.correction_m)}"
+    )
+    for name, poses in (("frame to frame", direct), ("as it came", mapped)):
+        report(name, np.array(poses), np.array(true))
+    report("after loops", corrected, np.array(true))
+    shares = ", ".join(f"{np.percentile(times_ms[1:], q):.0f}" for q in (50, 95, 100))
+    print(f"CPU time of a frame: {shares} ms (median, 95 %, largest)")
 
 
 if __name__ == "__main__":

@@ -188,6 +188,7 @@ class Pipeline:
         Raises:
             RefusedInput: if the frame does not fit the earlier ones; the graph is unchanged.
         """
+        self._follow(frame)
         with timed(self.times_s["perception"]):
             perceived = self.perception.perceive(frame)
         return self._add(frame, perceived)
@@ -224,11 +225,17 @@ class Pipeline:
         self, seen: UprightFrame, found: Future[tuple[Detections, float]]
     ) -> FrameResult:
         assert isinstance(self.perception, Perception)
+        self._follow(seen.original)
         wait([found])
         start = time.perf_counter()
         perceived = self.perception.perceive_detected(seen, lambda: found.result()[0])
         self.times_s["perception"].append(time.perf_counter() - start + found.result()[1])
         return self._add(seen.original, perceived)
+
+    def _follow(self, frame: RgbdFrame) -> None:
+        """Correct the graph, also if the frame that closed a loop is refused afterwards."""
+        if frame.trajectory is not None and self.builder is not None:
+            self.builder.apply_trajectory(*frame.trajectory[:2])
 
     def _add(self, frame: RgbdFrame, perceived: Perceived) -> FrameResult:
         with timed(self.times_s["lifting"]):

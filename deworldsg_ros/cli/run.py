@@ -53,17 +53,24 @@ from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.map_file import apart_of, check_paths, claim_map, continue_map, write_map
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.pipeline import FrameResult, Pipeline
-from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
+from deworldsg_ros.poses.loops import closings_in_words
 from deworldsg_ros.poses.trajectory import write_tum
 from deworldsg_ros.recordings.bags.storage import RawBag
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
-from deworldsg_ros.recordings.posing import PoseChoice, PosedSource, choose_poses, posed_frames
+from deworldsg_ros.recordings.posing import (
+    PoseChoice,
+    PosedSource,
+    UnposedSource,
+    choose_poses,
+    posed_frames,
+)
 from deworldsg_ros.recordings.recording import Recording, detect_kind, open_source
+from deworldsg_ros.recordings.replaying import check_output, write_mcap
 from deworldsg_ros.recordings.source import RawRoleMessage, Role, Source
-from deworldsg_ros.recordings.writer import check_output, write_mcap
 from deworldsg_ros.relocalisation import Returning
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import Trajectory
 from deworldsg_ros.scene.errors import (
     ConfigurationError,
     DeWorldSGError,
@@ -125,6 +132,7 @@ class _Processed:
 
     Attributes:
         poses: T_world_camera (4, 4) of each processed frame by its stamp in nanoseconds.
+        closings: of loops of odometry, in words.
         refused: frames that the pipeline or the odometry refused, by reason.
         updates: log of the graph's updates; None without `RunOptions.temporal`.
         album: some of the frames.
@@ -134,6 +142,7 @@ class _Processed:
     """
 
     poses: dict[int, Float64]
+    closings: str
     refused: Counter[str]
     updates: UpdateLog | None
     album: Album
@@ -215,8 +224,6 @@ def _run(options: RunOptions, console: Console, prepare: Callable[[], None] = la
         RecordingError: if no frame can be used.
     """
     config = effective_config(options.config_path, options.settings)
-    if options.poses.odometry and not HAS_ODOMETRY:
-        outputs.print_noted(console, "warning:", WITHOUT_ODOMETRY)
     source = open_source(
         options.recording,
         topics=options.topics,
@@ -283,6 +290,7 @@ def _process(
     """Process the frames of a recording, with a progress bar."""
     started_s = time.perf_counter()
     poses: dict[int, Float64] = {}
+    closings_m: list[float] = []
     album = Album()
     refused: Counter[str] = Counter()
     observer = RunObserver()
@@ -302,6 +310,9 @@ def _process(
         frames = posed_frames(recording, options.poses, refuse)
         chosen = itertools.islice(frames, options.max_frames or None)
         for frame, result in stack.enter_context(closing(pipeline.process_all(chosen))):
+            if frame.trajectory is not None:
+                closings_m.append(frame.trajectory.moved_m)
+                _correct(poses, frame.trajectory)
             if isinstance(result, RefusedInput):
                 refuse(result)
             else:
@@ -317,7 +328,15 @@ def _process(
                 break
         progress.update(task, note=_node_count(pipeline), total=len(poses) + refused.total())
     wall_s = time.perf_counter() - started_s
-    return _Processed(poses, refused, updates, album, observer, wall_s, stop.is_set())
+    closings = closings_in_words(len(closings_m), sum(closings_m[-1:]))
+    return _Processed(poses, closings, refused, updates, album, observer, wall_s, stop.is_set())
+
+
+def _correct(poses: dict[int, Float64], trajectory: Trajectory) -> None:
+    """Move the poses of frames as a closed loop did."""
+    if poses:
+        T_new_old = trajectory.at(np.array(list(poses), np.int64))
+        poses.update(zip(poses, T_new_old @ np.array(list(poses.values()))))
 
 
 def _note_update(
@@ -353,7 +372,7 @@ def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
             write_embeddings(path, wire.ns_from_stamp(graph.stamp), embeddings)
         world_up = pipeline.config.inputs.world_up
         frames = [
-            replace(frame, T_world_camera=T_graph_world @ frame.T_world_camera)
+            replace(frame, T_world_camera=T_graph_world @ processed.poses[frame.stamp_ns])
             for frame in processed.album.frames
         ]
         space = None if pipeline.builder is None else pipeline.builder.space
@@ -388,6 +407,8 @@ def _report(ran: _Ran, graph: wire.SceneGraphMessage) -> dict[str, Any]:
         "times_ms": _times_ms(pipeline.times_s),
         "device": device_name(),
     }
+    if isinstance(recording.source, UnposedSource):
+        report["loops"] = processed.closings
     if pipeline.relations.source != "none":
         report["clips"] = asdict(pipeline.relations.counters())
     if processed.updates is not None:
@@ -411,6 +432,8 @@ def _print_summary(
         console.print(f"hidden nodes (output.min_existence): {reasons}", highlight=False)
     if options.timings:
         _print_timings(console, pipeline.times_s, frames, processed.wall_s)
+    if options.poses.odometry:
+        console.print(processed.closings, highlight=False)
     outputs.print_files(console, options.out)
     if options.map_path is not None:
         path, what = options.map_path, "the map"

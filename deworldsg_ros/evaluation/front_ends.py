@@ -33,7 +33,7 @@ from deworldsg_ros.perception.protocols import Detections, Detector
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived, Perception
 from deworldsg_ros.pipeline import Perceiver
-from deworldsg_ros.poses.odometry import track_poses
+from deworldsg_ros.poses.loops import track_poses
 from deworldsg_ros.poses.trajectory import PoseNoise, perturb_poses, read_trajectory
 from deworldsg_ros.recordings.folders.annotations import Annotations, ScanAnnotation, ScanPoints
 from deworldsg_ros.recordings.folders.dataset import decode_image, read_file

@@ -29,9 +29,8 @@ from deworldsg_ros.recordings import replaying, source
 from deworldsg_ros.recordings.bags.topics import parse_topics
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.recordings.recording import open_source
-from deworldsg_ros.recordings.replaying import Pace, Window
+from deworldsg_ros.recordings.replaying import Pace, Window, topic_of
 from deworldsg_ros.recordings.source import RawRoleMessage, Role, Source
-from deworldsg_ros.recordings.writer import topic_of
 from deworldsg_ros.ros.health import (
     DROPPED,
     LISTENERS,

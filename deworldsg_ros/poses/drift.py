@@ -19,6 +19,7 @@ from deworldsg_ros.scene.gaussian import transform
 MAX_SURFELS = 20_000
 # At most this number of surfels is compared with a frame; fewer than MIN_MATCHES decide nothing.
 SAMPLES, MIN_MATCHES = 400, 100
+MAX_FRAME = 1 << 62
 # Maximum distance of a surfel from the depth image in each Gauss-Newton step: coarse, then fine.
 REACHES_M = (0.3, 0.2, 0.1, 0.1)
 # Weight of no motion, as a fraction of the mean weight of a translation axis. A radian weighs as
@@ -43,38 +44,72 @@ _View = tuple[float, float, float, float, UInt16]
 
 
 class SurfelMap:
-    """Surfels: position, normal (metres, world frame), number of frames, newest frame."""
+    """Surfels: position, normal (metres, world frame), number of frames, newest frame.
 
-    def __init__(self) -> None:
-        self._rows = np.zeros((MAX_SURFELS, 8))
-        self._count = self._frame = 0
-        self._seen = np.zeros(0, np.int64)
+    Args:
+        most: surfels; a full map drops the half that was not in view for the longest time.
+
+    Attributes:
+        frame: number of frames that were added.
+        seen: rows in view in the last `register`.
+    """
+
+    def __init__(self, most: int = MAX_SURFELS) -> None:
+        self._most, self._rows = most, np.zeros((MAX_SURFELS, 8))
+        self._count = self.frame = 0
+        self.seen = np.zeros(0, np.int64)
         self._view: _View
 
-    def register(self, T_world_camera: Float64, grid: DepthGrid) -> Float64 | None:
+    @property
+    def rows(self) -> Float64:
+        """The surfels (n, 8), not a copy."""
+        return self._rows[: self._count]
+
+    def register(
+        self, T_world_camera: Float64, grid: DepthGrid, since: int = 0, until: int = MAX_FRAME
+    ) -> Float64 | None:
         """The pose (4, 4) near a given one at which a frame fits the map; None if unknown.
 
         Gauss-Newton on the distances of the frame's depth from the planes of the surfels in view,
         projected into the frame. Directions that these planes leave open are not corrected.
+
+        Args:
+            T_world_camera: (4, 4) given pose.
+            grid: depth of the frame.
+            since: of surfels that count, the first newest frame.
+            until: the last one.
         """
         self._view = _view(grid)
-        rows, poses = self._rows[: self._count], (T_world_camera, invert_pose(T_world_camera))
-        self._seen, is_found, T_fitted = _register(rows, *poses, self._view)
+        poses = T_world_camera, invert_pose(T_world_camera)
+        self.seen, is_found, T_fitted = _register(self.rows, *poses, self._view, since, until)
         return T_fitted if is_found else None
 
     def add(self, T_world_camera: Float64) -> None:
         """Fuse the frame of the last `register`."""
         new = self._view[4].size // 4
-        if self._count + new > MAX_SURFELS:
-            newest = np.argsort(-self._rows[: self._count, 7], kind="stable")[: MAX_SURFELS // 2]
+        if self._count + new > self._most:
+            newest = np.argsort(-self._rows[: self._count, 7], kind="stable")[: self._most // 2]
             self._count = len(newest)
             self._rows[: self._count] = self._rows[newest]
-            self._seen = np.zeros(0, np.int64)
-        if self._count + new > len(self._rows):  # an image with more cells than half of a full map
-            self._rows = np.concatenate((self._rows, np.zeros((new, 8))))
-        self._frame += 1
-        arguments = T_world_camera, invert_pose(T_world_camera), self._view, self._frame
-        self._count = _fuse(self._rows, self._count, self._seen, *arguments)
+            self.seen = np.zeros(0, np.int64)
+        if self._count + new > len(self._rows):
+            more = max(new, min(len(self._rows), self._most - len(self._rows)))
+            self._rows = np.concatenate((self._rows, np.zeros((more, 8))))
+        self.frame += 1
+        arguments = T_world_camera, invert_pose(T_world_camera), self._view, self.frame
+        self._count = _fuse(self._rows, self._count, self.seen, *arguments)
+
+    def move(self, T_new_old: Float64, firsts: Int64) -> None:
+        """Move surfels with the keyframe that saw them last.
+
+        Args:
+            T_new_old: (k, 4, 4) of the keyframes.
+            firsts: (k,) the first frame of each, ascending.
+        """
+        rows = self.rows
+        T = T_new_old[np.maximum(firsts.searchsorted(rows[:, 7], "right") - 1, 0)]
+        rows[:, :3] = np.einsum("nij,nj->ni", T[:, :3, :3], rows[:, :3]) + T[:, :3, 3]
+        rows[:, 3:6] = np.einsum("nij,nj->ni", T[:, :3, :3], rows[:, 3:6])
 
 
 def about_camera(step: Float64, T_world_camera: Float64) -> Float64:
@@ -223,11 +258,13 @@ def _system(
 
 @kernel
 def _register(
-    rows: Float64, T: Float64, T_camera_world: Float64, view: _View
+    rows: Float64, T: Float64, T_camera_world: Float64, view: _View, since: int, until: int
 ) -> tuple[Int64, bool, Float64]:
     """The surfels in view that the depth image does not hide; whether enough fit, at which pose."""
     seen, count = np.empty(len(rows), np.int64), 0
     for index in range(len(rows)):
+        if not since <= rows[index, 7] <= until:
+            continue
         row, _, depth, measured = _pixel(T_camera_world, rows[index], view)
         if row >= 0 and depth < measured + REACHES_M[0]:
             seen[count] = index

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -12,7 +11,6 @@ import numpy as np
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt8
 from deworldsg_ros.scene.camera import (
     Intrinsics,
-    RgbdFrame,
     check_pose,
     interpolate_pose,
     invert_pose,
@@ -158,14 +156,12 @@ def _pixels_of(points: Float64, intrinsics: Intrinsics) -> tuple[Int64, Int64, B
 
 # --- RGB-D odometry: camera poses from the images alone, for robots without SLAM.
 #
-# 1. OpenCV's RGB-D odometry aligns each frame with a reference frame. It minimises photometric and
-#    point-to-plane residuals on an image pyramid.
-# 2. If the depth does not fit afterwards, `depth_alignment` refines that alignment and a constant-
-#    motion prediction. A fast rotation exceeds the reach of the pyramid.
+# 1. ORB features of the images that have depth are matched with those of a reference frame
+#    [E. Rublee et al., "ORB", ICCV 2011]. RANSAC finds the rigid motion that most of them agree on
+#    [M. Fischler and R. Bolles, 1981].
+# 2. If the depth does not fit afterwards, or nothing was matched, point-to-plane ICP refines that
+#    motion and a constant-motion prediction.
 # 3. The reference is the last frame, or an older one while the camera has hardly moved.
-#
-# OpenCV before version 5 has no RGB-D odometry. Then `depth_alignment` alone refines the constant-
-# motion prediction and the identity. There is no loop closure.
 
 # Pose of the first camera unless one is given: at the origin, looking along x, z up (REP 103).
 LEVEL_CAMERA = np.array(
@@ -194,20 +190,89 @@ RESTART_AFTER = 15
 # the fraction grows by at least MIN_GAIN.
 GOOD_FIT = 0.97
 MIN_GAIN = 0.005
-# OpenCV has RGB-D odometry from version 5 on. Version 5 needs numpy 2; a sourced ROS 2 Jazzy has
-# numpy 1.
-HAS_ODOMETRY = hasattr(cv2, "Odometry")
-WITHOUT_ODOMETRY = (
-    f"OpenCV {cv2.__version__} has no RGB-D odometry (version 5 has): only depth is aligned, and "
-    "the poses drift more"
-)
+# Features of an image, samples of three matches, and matches that have to agree on a motion.
+FEATURES, SAMPLES, MIN_AGREE = 600, 200, 25
+# They are found in an image of this width: larger ones take longer, small ones have few.
+FEATURE_COLUMNS = 640
+# Matched points agree if they are this far apart after the motion: noise of depth, at its square.
+AGREE_M, AGREE_PER_M = 0.015, 0.005
+
+
+class Features(NamedTuple):
+    """ORB features of an image, with depth.
+
+    Attributes:
+        points: (n, 3) camera frame, metres.
+        descriptors: (n, 32) uint8.
+    """
+
+    points: Float64
+    descriptors: UInt8
+
+
+NO_FEATURES = Features(np.zeros((0, 3)), np.zeros((0, 32), np.uint8))
+
+
+def features_of(rgb: UInt8, depth_m: Float32, intrinsics: Intrinsics) -> Features:
+    """The features of an image (H, W, 3) whose pixels have depth (H, W)."""
+    grey, scale = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), FEATURE_COLUMNS / rgb.shape[1]
+    if scale != 1.0:
+        method = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=method)
+    found, descriptors = cv2.ORB.create(FEATURES, fastThreshold=7).detectAndCompute(grey, None)
+    if not found:
+        return NO_FEATURES
+    columns, rows = ((np.array([point.pt for point in found]) + 0.5) / scale - 0.5).T
+    last_row, last_column = np.subtract(depth_m.shape, 1)
+    at = (
+        np.clip(np.rint(rows).astype(int), 0, last_row),
+        np.clip(np.rint(columns).astype(int), 0, last_column),
+    )
+    z = depth_m[at].astype(np.float64)
+    points = intrinsics.back_project(columns, rows, z)
+    return Features(points[z > 0], descriptors[z > 0])
+
+
+def motion_of(a: Features, b: Features) -> tuple[Float64, int]:
+    """T_b_a (4, 4) that most matches agree on, and their number; the identity and 0 if too few."""
+    if min(len(a.points), len(b.points)) < MIN_AGREE:
+        return np.eye(4), 0
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+    pairs = matcher.match(a.descriptors, b.descriptors)
+    if len(pairs) < MIN_AGREE:
+        return np.eye(4), 0
+    x = a.points[[pair.queryIdx for pair in pairs]]
+    y = b.points[[pair.trainIdx for pair in pairs]]
+    near = AGREE_M + AGREE_PER_M * y[:, 2] ** 2
+    chosen = np.random.default_rng(0).integers(0, len(x), (SAMPLES, 3))
+    T = _rigid_motions(x[chosen], y[chosen])
+    for _ in range(3):  # the best sample, then what agrees with it
+        moved = x @ T[:, :3, :3].swapaxes(1, 2) + T[:, None, :3, 3]
+        agree = np.linalg.norm(moved - y, axis=2) < near
+        best = agree[agree.sum(axis=1).argmax()]
+        if best.sum() < MIN_AGREE:
+            return np.eye(4), 0
+        T = _rigid_motions(x[best][None], y[best][None])
+    return T[0], int(best.sum())
+
+
+def _rigid_motions(x: Float64, y: Float64) -> Float64:
+    """The rigid motions (k, 4, 4) that take points x (k, n, 3) nearest to y (Kabsch 1976)."""
+    mean_x, mean_y = x.mean(axis=1, keepdims=True), y.mean(axis=1, keepdims=True)
+    u, _, v = np.linalg.svd((x - mean_x).swapaxes(1, 2) @ (y - mean_y))
+    sign = np.sign(np.linalg.det(u @ v))
+    u[:, :, 2] *= sign[:, None]
+    T = np.broadcast_to(np.eye(4), (len(x), 4, 4)).copy()
+    T[:, :3, :3] = (u @ v).swapaxes(1, 2)
+    T[:, :3, 3] = mean_y[:, 0] - (T[:, :3, :3] @ mean_x.swapaxes(1, 2))[:, :, 0]
+    return T
 
 
 @dataclass(frozen=True, eq=False)
 class _TrackedFrame:
     """A frame prepared for alignment, some of its points, and its pose."""
 
-    frame: Any
+    features: Features
     points: Float64
     T_world_camera: Float64
 
@@ -218,12 +283,12 @@ class RgbdOdometry:
     Args:
         T_world_start: (4, 4) pose of the first frame; None = level, at the origin, looking along x.
         restart_after: lost frames in a row after which tracking restarts at the last known pose.
-        depth_only: align depth only, without OpenCV's RGB-D odometry.
 
     Attributes:
         tracked: number of frames with a pose.
         lost: number of frames without a pose.
         restarts: number of restarts at the last known pose.
+        features: of the newest frame with depth, tracked or lost.
 
     Raises:
         RefusedInput: ``invalid_pose`` if `T_world_start` is no rigid transform.
@@ -234,20 +299,18 @@ class RgbdOdometry:
         T_world_start: Float64 | None = None,
         *,
         restart_after: int = RESTART_AFTER,
-        depth_only: bool = not HAS_ODOMETRY,
     ) -> None:
         self._T_world_start = LEVEL_CAMERA if T_world_start is None else T_world_start
         check_pose(self._T_world_start)
         self._restart_after = restart_after
-        self._depth_only = depth_only
         self._intrinsics: Intrinsics | None = None
-        self._odometry: Any = None
         self._reference: _TrackedFrame | None = None
         self._newest: _TrackedFrame | None = None
         # Motion of the camera between the two newest frames.
         self._motion = np.eye(4)
         self._lost_in_a_row = 0
         self.tracked = self.lost = self.restarts = 0
+        self.features, self._points = NO_FEATURES, np.zeros((0, 3))
 
     def track(self, rgb: UInt8, depth_m: Float32, intrinsics: Intrinsics) -> Float64:
         """T_world_camera (4, 4) of the next frame.
@@ -268,21 +331,27 @@ class RgbdOdometry:
         points = points_of(depth_m, intrinsics)
         if len(points) < MIN_POINTS:
             raise self._lose(f"fewer than {MIN_POINTS} pixels of its grid have depth")
-        frame = self._prepare(rgb, depth_m)
+        features = self.features = features_of(rgb, depth_m, intrinsics)
+        self._points = points
         if self._newest is None or self._reference is None:
-            return self._accept(_TrackedFrame(frame, points, self._T_world_start), restart=True)
+            return self._accept(_TrackedFrame(features, points, self._T_world_start), restart=True)
         reasons = []
         for earlier in dict.fromkeys((self._reference, self._newest)):
-            T_camera_earlier, reason = self._align(earlier, frame, depth_m, intrinsics)
+            T_camera_earlier, reason = self._align(earlier, features, depth_m, intrinsics)
             if T_camera_earlier is not None:
-                T_world_camera = _rigid(earlier.T_world_camera @ invert_pose(T_camera_earlier))
-                return self._accept(_TrackedFrame(frame, points, T_world_camera))
+                T_world_camera = rigid(earlier.T_world_camera @ invert_pose(T_camera_earlier))
+                return self._accept(_TrackedFrame(features, points, T_world_camera))
             reasons.append(reason)
         if self._lost_in_a_row >= self._restart_after:
             self.restarts += 1
             last_pose = self._newest.T_world_camera
-            return self._accept(_TrackedFrame(frame, points, last_pose), restart=True)
+            return self._accept(_TrackedFrame(features, points, last_pose), restart=True)
         raise self._lose(reasons[-1])
+
+    def resume(self, T_world_camera: Float64) -> None:
+        """Go on from the newest frame, which was lost, at a pose (4, 4) that is known otherwise."""
+        self.lost -= 1
+        self._accept(_TrackedFrame(self.features, self._points, T_world_camera), restart=True)
 
     def _begin(self, intrinsics: Intrinsics) -> None:
         """Set up the alignment; with new intrinsics, continue from the last known pose."""
@@ -291,34 +360,22 @@ class RgbdOdometry:
             self.restarts += 1
         self._intrinsics = intrinsics
         self._reference = self._newest = None
-        if self._depth_only:
-            return
-        settings = cv2.OdometrySettings()
-        settings.setCameraMatrix(intrinsics.matrix.astype(np.float32))
-        settings.setMaxDepth(MAX_DEPTH_M)
-        settings.setMaxTranslation(MAX_STEP_M)
-        settings.setMaxRotation(MAX_ROTATION_DEG)
-        self._odometry = cv2.Odometry(
-            cv2.OdometryType_RGB_DEPTH, settings, cv2.OdometryAlgoType_COMMON
-        )
-
-    def _prepare(self, rgb: UInt8, depth_m: Float32) -> Any:
-        if self._depth_only:
-            return None
-        with_nan = np.where(depth_m > 0, depth_m, np.float32(np.nan)).astype(np.float32)
-        frame = cv2.OdometryFrame(with_nan, np.ascontiguousarray(rgb[:, :, ::-1]))
-        self._odometry.prepareFrame(frame)
-        return frame
 
     def _align(
         self,
         earlier: _TrackedFrame,
-        frame: Any,
+        features: Features,
         depth_m: Float32,
         intrinsics: Intrinsics,
     ) -> tuple[Float64 | None, str]:
         """T_camera_earlier; or None and the reason for rejecting it."""
-        guesses = self._guesses(earlier, frame, depth_m, intrinsics)
+        T_matched, agree = motion_of(earlier.features, features)
+        predicted = self._predicted(earlier)
+        guesses = [T_matched, predicted]
+        if not agree:
+            surface = surface_of(depth_m, intrinsics)
+            starts = (predicted, np.eye(4))
+            guesses = [refine(earlier.points, surface, start, intrinsics) for start in starts]
         best, fit = _refined(earlier.points, depth_m, guesses, intrinsics)
         step_m = float(np.linalg.norm(best[:3, 3]))
         if fit < MIN_FIT:
@@ -332,24 +389,6 @@ class RgbdOdometry:
                 f"{MAX_ROTATION_DEG:.0f}"
             )
         return best, ""
-
-    def _guesses(
-        self,
-        earlier: _TrackedFrame,
-        frame: Any,
-        depth_m: Float32,
-        intrinsics: Intrinsics,
-    ) -> list[Float64]:
-        """Candidates for T_camera_earlier, the most trusted first."""
-        predicted = self._predicted(earlier)
-        if self._depth_only:
-            surface = surface_of(depth_m, intrinsics)
-            starts = (predicted, np.eye(4))
-            return [refine(earlier.points, surface, start, intrinsics) for start in starts]
-        found, T_camera_earlier = self._odometry.compute(earlier.frame, frame)
-        if found and np.isfinite(T_camera_earlier).all():
-            return [np.asarray(T_camera_earlier, np.float64), predicted]
-        return [predicted]
 
     def _predicted(self, earlier: _TrackedFrame) -> Float64:
         """T_camera_earlier if the camera continues its last motion."""
@@ -404,34 +443,6 @@ def _moved(a: _TrackedFrame, b: _TrackedFrame) -> bool:
     )
 
 
-def _rigid(T: Float64) -> Float64:
+def rigid(T: Float64) -> Float64:
     """The same transform with an exact rotation: rounding errors of products accumulate."""
     return interpolate_pose(T, T, 0.0)
-
-
-# --- Streams of frames whose poses come from odometry.
-
-OnRefusal = Callable[[RefusedInput], None]
-
-
-def track_poses(
-    frames: Iterable[RgbdFrame],
-    T_world_start: Float64 | None = None,
-    on_lost: OnRefusal | None = None,
-) -> Iterator[RgbdFrame]:
-    """Replace the poses of frames by those of RGB-D odometry; lost frames are left out.
-
-    Args:
-        frames: their own poses are ignored.
-        T_world_start: (4, 4) pose of the first frame; None = level, at the origin.
-        on_lost: called with the refusal of each lost frame.
-    """
-    odometry = RgbdOdometry(T_world_start)
-    for frame in frames:
-        try:
-            T_world_camera = odometry.track(frame.rgb, frame.depth_m, frame.intrinsics)
-        except RefusedInput as refusal:
-            if on_lost is not None:
-                on_lost(refusal)
-            continue
-        yield replace(frame, T_world_camera=T_world_camera)

@@ -93,10 +93,14 @@ def parse_numbers(text: str, names: Sequence[str], what: str) -> dict[str, float
 
 
 def perturb_poses(frames: Iterable[RgbdFrame], noise: PoseNoise) -> Iterator[RgbdFrame]:
-    """The frames with perturbed poses; the same noise and frames give the same poses."""
+    """The frames with perturbed poses; the same noise and frames give the same poses.
+
+    They bring no trajectory: what odometry has corrected was not what was perturbed.
+    """
     perturbation = Perturbation(noise)
     for frame in frames:
-        yield replace(frame, T_world_camera=perturbation.apply(frame.T_world_camera))
+        T = perturbation.apply(frame.T_world_camera)
+        yield replace(frame, T_world_camera=T, trajectory=None)
 
 
 class Perturbation:

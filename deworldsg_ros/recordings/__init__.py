@@ -4,6 +4,6 @@ Start at `recording`: `open_source` opens a bag or a folder as a `Source` of mes
 (`source`, `messages`), and `Recording` joins these messages to frames with poses, with the
 assembler of the nodes. `bags` reads rosbag2, damaged files too; `folders` reads data sets, one file
 each, and their annotations. `posing` replaces the poses of a recording (trajectory, odometry,
-noise). `writer` converts a source to an MCAP file; `pacing` and `events` serve the replay node.
+noise). `replaying` serves the replay node, and converts a source to an MCAP file.
 Imports point one way: errors, messages <- source <- bags, folders <- recording <- posing.
 """

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from deworldsg_ros.config import Config
-from deworldsg_ros.poses.odometry import ODOMETRY_FRAME, OnRefusal, track_poses
+from deworldsg_ros.poses.loops import OnRefusal, track_poses
+from deworldsg_ros.poses.odometry import ODOMETRY_FRAME
 from deworldsg_ros.poses.trajectory import PoseNoise, Trajectory, perturb_poses, read_trajectory
 from deworldsg_ros.recordings.folders.sequence import rotated_pose
 from deworldsg_ros.recordings.recording import Recording

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,6 +177,30 @@ class SentDetections:
         return len(self.scores)
 
 
+class Trajectory(NamedTuple):
+    """Corrected poses of earlier frames, as a closed loop gives them.
+
+    Attributes:
+        stamps_ns: (k,) ascending.
+        T_world_camera: (k, 4, 4) corrected poses.
+        T_new_old: (k, 4, 4) how each one was corrected, world frame.
+    """
+
+    stamps_ns: Int64
+    T_world_camera: Float64
+    T_new_old: Float64
+
+    @property
+    def moved_m(self) -> float:
+        """How far the newest pose was moved."""
+        new, T = self.T_world_camera[-1], self.T_new_old[-1]
+        return float(np.linalg.norm((new - invert_pose(T) @ new)[:3, 3]))
+
+    def at(self, stamps_ns: Int64) -> Float64:
+        """How poses (n, 4, 4) at n stamps were corrected, between the keyframes evenly."""
+        return interpolate_poses(self.stamps_ns, self.T_new_old, stamps_ns)
+
+
 @dataclass(frozen=True)
 class RgbdFrame:
     """One registered RGB-D image with its pose, checked.
@@ -189,6 +213,8 @@ class RgbdFrame:
         T_world_camera: (4, 4) float64, camera optical frame to world.
         frame_id: name of the world frame.
         sent: objects that another process has found in the image; None = none was asked.
+        trajectory: of the frames before, if it was corrected with this frame; the poses from this
+            frame on are corrected.
 
     Raises:
         RefusedInput: ``grid_mismatch`` if the sizes differ, ``invalid_pose`` for a bad pose.
@@ -201,6 +227,7 @@ class RgbdFrame:
     T_world_camera: Float64
     frame_id: str = "world"
     sent: SentDetections | None = None
+    trajectory: Trajectory | None = None
 
     def __post_init__(self) -> None:
         grid = (self.intrinsics.height, self.intrinsics.width)

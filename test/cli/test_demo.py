@@ -17,8 +17,8 @@ from support.cli import DEMO_ROOM, deworldsg, start
 from deworldsg_ros.cli import demo
 from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.recordings.recording import open_source
+from deworldsg_ros.recordings.replaying import write_mcap
 from deworldsg_ros.recordings.source import Role
-from deworldsg_ros.recordings.writer import write_mcap
 from deworldsg_ros.wire import messages as wire
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]

@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 
+import numpy as np
 import pytest
 from support.cli import COMMAND, DEMO_ROOM, deworldsg, environment, invoke, printed
 from support.recordings import camera_items, write_bag
@@ -15,7 +16,10 @@ from deworldsg_ros.cli.outputs import Album
 from deworldsg_ros.config import load_config
 from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.graph.graph_files import read_graph
+from deworldsg_ros.poses.loops import LoopOdometry
+from deworldsg_ros.poses.trajectory import read_trajectory
 from deworldsg_ros.relations.world_model import FakeWorldModel
+from deworldsg_ros.scene.camera import Trajectory, rigid_motion
 from deworldsg_ros.wire import messages as wire
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
@@ -57,6 +61,31 @@ def test_a_recording_without_a_usable_frame_is_an_error_with_reasons(tmp_path):
     assert result.returncode == 2
     assert "3 no_depth" in result.stdout
     assert "not one frame" in result.stderr
+
+
+def test_a_closed_loop_corrects_the_poses_that_are_saved(tmp_path, monkeypatch):
+    track, poses, shift = LoopOdometry.track, {}, rigid_motion(np.array([0.5, 0, 0]), np.zeros(3))
+
+    def closing_at_the_fourth(odometry, stamp_ns, *image):
+        T, _ = track(odometry, stamp_ns, *image)
+        poses[stamp_ns] = T
+        if len(poses) != 4:
+            return T, None
+        moved = shift @ np.array(list(poses.values()))
+        return moved[-1], Trajectory(np.array(list(poses)), moved, np.tile(shift, (4, 1, 1)))
+
+    monkeypatch.setattr(LoopOdometry, "track", closing_at_the_fourth)
+    shown = printed(
+        *("run", DEMO_ROOM, "--odometry", "--out", tmp_path / "out", "--max-frames", "4"),
+        *("--save-trajectory", tmp_path / "poses.txt"),
+    )
+    assert "loop closed 1 time, last correction 50.0 cm" in shown
+    report = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert report["loops"] == "loop closed 1 time, last correction 50.0 cm"
+    saved = read_trajectory(tmp_path / "poses.txt")
+    assert saved.keys == tuple(poses)
+    expected = shift @ np.array(list(poses.values()))
+    np.testing.assert_allclose(saved.T_world_cameras, expected, atol=1e-6)
 
 
 class Broken(FakeWorldModel):

@@ -17,7 +17,7 @@ from deworldsg_ros.cli import outputs
 from deworldsg_ros.config import Config, OutputConfig
 from deworldsg_ros.graph.graph_files import GRAPH_FILE, read_graph, write_graph
 from deworldsg_ros.recordings.recording import open_source
-from deworldsg_ros.recordings.writer import write_mcap
+from deworldsg_ros.recordings.replaying import write_mcap
 
 PACKAGE = Path(outputs.__file__).resolve().parents[1]
 # Whatever writes a file without `deworldsg_ros/base/files.py`.

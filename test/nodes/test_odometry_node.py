@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 from sensor_msgs.msg import CameraInfo, Image
 from support.corner_room import INTRINSICS, LEVEL, corner_frame, walk
 from support.nodes_bench import Bench, camera_info, changed, image, works
@@ -14,12 +14,13 @@ from support.streams import at as pose_at
 
 from deworldsg_ros.nodes.odometry_node import OdometryNode
 from deworldsg_ros.ros.transforms import camera_transform
-from deworldsg_ros.scene.camera import invert_pose
+from deworldsg_ros.scene.camera import Trajectory, invert_pose
 from deworldsg_ros.streams.poses import (
     TransformTree,
     pose_from_message,
     pose_from_transform,
     stamp_ns_of,
+    trajectory_from_message,
 )
 
 TOPICS = {"rgb/image_raw": Image, "depth/image_raw": Image, "rgb/camera_info": CameraInfo}
@@ -82,6 +83,24 @@ def test_poses_follow_the_camera(odometry):
         assert other.pose.pose == message.pose
     assert odometry.node.more_values()["odometry tracked"] == "6"
     assert odometry.node.waiting_for(0) == []
+
+
+def test_a_closed_loop_is_published_as_the_trajectory_that_graphs_follow(odometry, monkeypatch):
+    paths, poses = collect(odometry, Path, "deworldsg/trajectory"), collect(odometry)
+    assert "open" in odometry.node.more_values()["odometry loops"]
+    stamps_ns, corrected = np.array([10, 20]), np.array([LEVEL, pose_at(1.0, 2.0) @ LEVEL])
+    closing = Trajectory(stamps_ns, corrected, np.array([np.eye(4), pose_at(0.5)]))
+    loops = odometry.node._odometry
+    monkeypatch.setattr(loops, "track", lambda *frame: (corrected[1], closing))
+    loops.closed, loops.correction_m = 2, 0.5
+    tracked(odometry, LEVEL)
+    odometry.expect(lambda: len(paths) == len(poses) == 1, "a trajectory and a pose")
+    got_ns, got, frame_id = trajectory_from_message(paths[0])
+    np.testing.assert_array_equal(got_ns, stamps_ns)
+    np.testing.assert_allclose(got, corrected, atol=1e-12)
+    assert frame_id == "odom"
+    values = odometry.node.more_values()
+    assert values["odometry loops"] == "loop closed 2 times, last correction 50.0 cm"
 
 
 def test_a_lost_frame_has_no_pose_and_is_counted(odometry):

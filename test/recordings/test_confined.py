@@ -10,7 +10,7 @@ from deworldsg_ros.base.files import confined
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.folders.dataset import read_file
 from deworldsg_ros.recordings.recording import open_source
-from deworldsg_ros.recordings.writer import write_mcap
+from deworldsg_ros.recordings.replaying import write_mcap
 from deworldsg_ros.scene.errors import ConfigurationError, RecordingError
 from deworldsg_ros.training.clips import read_clip_folder
 

@@ -12,8 +12,8 @@ from support.recordings import STRING, camera_items, read_bag, stamp_ns, text_it
 from deworldsg_ros.recordings.bags import storage
 from deworldsg_ros.recordings.bags.storage import RawBag, salvage_sqlite
 from deworldsg_ros.recordings.recording import open_recording, open_source
+from deworldsg_ros.recordings.replaying import write_mcap
 from deworldsg_ros.recordings.source import CAMERA_INFO, POSE_STAMPED, typestore
-from deworldsg_ros.recordings.writer import write_mcap
 from deworldsg_ros.scene.errors import RecordingError
 
 COUNT = 4

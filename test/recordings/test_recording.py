@@ -23,8 +23,8 @@ from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.recordings import source as ros
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.recording import open_recording, open_source
+from deworldsg_ros.recordings.replaying import write_mcap
 from deworldsg_ros.recordings.source import Role
-from deworldsg_ros.recordings.writer import write_mcap
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.errors import RecordingError
 

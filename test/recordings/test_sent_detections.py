@@ -13,7 +13,7 @@ from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.recording import Recording, open_recording, open_source
-from deworldsg_ros.recordings.writer import write_mcap
+from deworldsg_ros.recordings.replaying import write_mcap
 from deworldsg_ros.scene.errors import RecordingError, RefusedInput
 
 FRAMES = 40

@@ -13,7 +13,10 @@ LEVEL = np.array(
 WALLS = ((0, 3.0), (1, 0.8), (2, -0.4))
 
 
-def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:
+def corner_frame(
+    T_world_camera: np.ndarray, stamp_ns: int = 0, *, is_tiled: bool = False
+) -> RgbdFrame:
+    """A frame; its surfaces have soft waves of colour, or tiles of 10 cm, each of its own grey."""
     v, u = np.mgrid[: INTRINSICS.height, : INTRINSICS.width]
     rays = INTRINSICS.back_project(u, v, np.ones(u.shape))
     directions = rays @ T_world_camera[:3, :3].T
@@ -25,6 +28,9 @@ def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:
     points = T_world_camera[:3, 3] + depth[..., None] * directions
     waves = [np.sin(points @ direction + phase) for direction, phase in WAVES]
     rgb = np.stack([127 + 40 * (waves[i] + waves[i + 1] + waves[i + 2]) for i in range(3)], -1)
+    if is_tiled:
+        tiles = np.floor(10.0 * points + 0.01).astype(np.int64) @ (73856093, 19349663, 83492791)
+        rgb = np.repeat((tiles % 211 + 20.0)[..., None], 3, axis=2)
     return RgbdFrame(
         stamp_ns,
         np.clip(rgb, 0, 255).astype(np.uint8),

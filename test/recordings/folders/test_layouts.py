@@ -32,8 +32,8 @@ from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.folders.sequence import resample, rotated_intrinsics, rotated_pose
 from deworldsg_ros.recordings.posing import PoseChoice, choose_poses
 from deworldsg_ros.recordings.recording import Recording, detect_kind, open_recording, open_source
+from deworldsg_ros.recordings.replaying import write_mcap
 from deworldsg_ros.recordings.source import Role
-from deworldsg_ros.recordings.writer import write_mcap
 from deworldsg_ros.scene.camera import Intrinsics, interpolate_pose, pose_from_quaternion
 from deworldsg_ros.scene.errors import RecordingError
 
