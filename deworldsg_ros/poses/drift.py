@@ -25,6 +25,10 @@ REACHES_M = (0.3, 0.2, 0.1, 0.1)
 # Weight of no motion, as a fraction of the mean weight of a translation axis. A radian weighs as
 # much as RADIAN_M metres: the usual distance of surfaces.
 DAMPING, RADIAN_M = 0.03, 2.5
+# Directions of a motion that the planes hold by less than this part of all are not corrected. With
+# exact poses in three simulated homes, the mean correction is 0.5 cm (6.4 cm without this, and with
+# the far sides of walls); with poses that tremble and drift, 0.005 and more lose accuracy.
+MIN_HELD = 0.003
 JOINT = np.array([RADIAN_M**2] * 3 + [1.0] * 3)  # squared rotation and translation, in m²
 # Standard deviation of depth, metres: constant, and times squared depth (structured light).
 # Residuals beyond OUTLIER of them have small weights (Cauchy).
@@ -81,8 +85,9 @@ class SurfelMap:
         """
         self._view = _view(grid)
         poses = T_world_camera, invert_pose(T_world_camera)
-        self.seen, is_found, T_fitted = _register(self.rows, *poses, self._view, since, until)
-        return T_fitted if is_found else None
+        fitted = _register(self.rows, *poses, self._view, since, until)
+        self.seen, is_found, T_fitted, hessian = fitted
+        return _as_held(T_world_camera, T_fitted, hessian) if is_found else None
 
     def add(self, T_world_camera: Float64) -> None:
         """Fuse the frame of the last `register`."""
@@ -256,14 +261,40 @@ def _system(
     return hessian, gradient, matches
 
 
+def _as_held(T: Float64, T_fitted: Float64, hessian: Float64) -> Float64:
+    """The pose T, moved to a fitted one in the directions that the planes hold.
+
+    In the others, noise would move it [J. Zhang, M. Kaess and S. Singh, "On degeneracy of
+    optimization-based state estimation problems", ICRA 2016].
+    """
+    scale = np.sqrt(JOINT)
+    values, directions = np.linalg.eigh(hessian / np.outer(scale, scale))
+    values -= DAMPING / 3.0 * np.trace(hessian[3:, 3:]) / (1.0 + DAMPING)
+    free = directions[:, values < MIN_HELD * values.sum()]
+    if not free.size:
+        return T_fitted
+    step = scale * difference(T, T_fitted)
+    return stepped((step - free @ (free.T @ step)) / scale, T)
+
+
 @kernel
 def _register(
     rows: Float64, T: Float64, T_camera_world: Float64, view: _View, since: int, until: int
-) -> tuple[Int64, bool, Float64]:
-    """The surfels in view that the depth image does not hide; whether enough fit, at which pose."""
+) -> tuple[Int64, bool, Float64, Float64]:
+    """The surfels in view that the depth image does not hide; whether enough fit, at which pose.
+
+    Last, the damped normal equations (6, 6) of the last step.
+    """
+    system = np.eye(6)
     seen, count = np.empty(len(rows), np.int64), 0
     for index in range(len(rows)):
         if not since <= rows[index, 7] <= until:
+            continue
+        # The other side of a wall is not in view. Normals point away from the camera.
+        facing = 0.0
+        for axis in range(3):
+            facing += (rows[index, axis] - T[axis, 3]) * rows[index, 3 + axis]
+        if facing < 0.0:
             continue
         row, _, depth, measured = _pixel(T_camera_world, rows[index], view)
         if row >= 0 and depth < measured + REACHES_M[0]:
@@ -273,11 +304,12 @@ def _register(
     for reach_m in REACHES_M:
         hessian, step, matches = _system(rows, seen, T, view, reach_m)
         if matches < MIN_MATCHES:
-            return seen, False, T
+            return seen, False, T, system
+        system[:] = hessian
         # Gauss: the equations are positive definite, or singular.
         for k in range(6):
             if not hessian[k, k] > 0.0:
-                return seen, False, T
+                return seen, False, T, system
             for i in range(k + 1, 6):
                 factor = hessian[i, k] / hessian[k, k]
                 step[i] -= factor * step[k]
@@ -288,7 +320,7 @@ def _register(
                 step[i] -= hessian[i, j] * step[j]
             step[i] /= hessian[i, i]
         T = stepped(step, T)
-    return seen, True, T
+    return seen, True, T, system
 
 
 @kernel

@@ -107,6 +107,25 @@ def test_a_single_plane_is_no_reason_to_slide():
     assert turn[2] == pytest.approx(2, abs=0.2)
 
 
+def test_the_far_side_of_a_thin_wall_is_another_surface():
+    # The wall is 12 cm thick. In the next room, floor, ceiling and side walls are the same.
+    sides = [ROOM[0], ROOM[1], ROOM[3], ROOM[4]]
+    surfels = map_of([(np.eye(4), [*sides, ((0, 0, 1), 2.0)])] * 5)
+    T = pose((0, 180, 0), (0, 0, 4.0))
+    fitted = surfels.register(T, depth_of(T, [*sides, ((0, 0, -1), -2.12)]))
+    assert fitted is None or np.linalg.norm(difference(T, fitted)[3:]) < 0.01
+
+
+def test_exact_poses_stay_in_a_corridor():
+    # Nothing but noise tells how far along it the camera is.
+    corridor = [((0, 1, 0), 1.2), ((0, -1, 0), 1.3), ((1, 0, 0), 0.8), ((-1, 0, 0), 0.8)]
+    drift = Drift()
+    for stamp in range(60):
+        T = pose((0, 4 * np.sin(stamp / 8), 0), (0, 0, 0.05 * stamp))
+        drift.align(seen(stamp, T, T, corridor))
+    assert np.linalg.norm(difference(T, drift.T_graph_poses @ T)[3:]) < 0.01
+
+
 def test_the_map_is_bounded_and_forgets_surfaces_that_are_gone():
     def corridor(step):
         return pose(shift_m=(0, 0, step)), [*ROOM[:2], ((0, 0, 1), 3.0 + step), *ROOM[3:]]
