@@ -247,6 +247,41 @@ class Ends:
         return np.asarray((apart < END_M) & self.same_axes(other)[:, None])
 
 
+class RoomHeading:
+    """The heading of the room, by the votes of its large objects."""
+
+    def __init__(self) -> None:
+        # By node: the long side, turned by four times its heading, so that quarter turns are the
+        # same.
+        self._votes: dict[int, complex] = {}
+        # Of all votes, and what it would be if all were the same.
+        self._sum, self._most = 0j, 0.0
+
+    @property
+    def step(self) -> int | None:
+        """The heading, in `HEADINGS`; None = not known."""
+        if len(self._votes) < MIN_VOTES or abs(self._sum) < MIN_AGREEMENT * self._most:
+            return None
+        return round(cmath.phase(self._sum) / (2.0 * math.pi) * HEADINGS) % HEADINGS
+
+    def vote(self, node_ids: Iterable[int], extents: Iterable[Extent]) -> None:
+        """Take the votes of nodes, in place of older ones."""
+        for node_id, extent in zip(node_ids, extents):
+            vote = cmath.rect(extent.side_m, 2.0 * math.pi * extent.step / HEADINGS)
+            self._set(node_id, vote if extent.side_m >= MIN_VOTING_M else 0j)
+
+    def forget(self, node_ids: Iterable[int]) -> None:
+        """Nodes that are gone have no say."""
+        for node_id in node_ids:
+            self._set(node_id, 0j)
+
+    def _set(self, node_id: int, vote: complex) -> None:
+        old = self._votes.pop(node_id, 0j)
+        if vote:
+            self._votes[node_id] = vote
+        self._sum, self._most = self._sum + vote - old, self._most + abs(vote) - abs(old)
+
+
 class NodeBoxes:
     """Measures the boxes of nodes, and follows where they end.
 
@@ -259,49 +294,19 @@ class NodeBoxes:
         self._nodes = nodes
         self._shown = shown
         self._ends: dict[int, Ends] = {}
-        # Of the nodes that vote for the heading of the room: the long side, turned by four times
-        # its heading, so that quarter turns are the same.
-        self._votes: dict[int, complex] = {}
-        # Of all votes, and what it would be if all were the same.
-        self._sum, self._most = 0j, 0.0
+        # Of the boxes whose ends are followed, which does not depend on when messages are made.
+        self._heading = RoomHeading()
 
-    @property
-    def room_step(self) -> int | None:
-        """Heading of the room, in `HEADINGS`, which boxes prefer; None = not known."""
-        if len(self._votes) < MIN_VOTES or abs(self._sum) < MIN_AGREEMENT * self._most:
-            return None
-        return round(cmath.phase(self._sum) / (2.0 * math.pi) * HEADINGS) % HEADINGS
-
-    def extents(self, slots: Int64, up: Sequence[float]) -> list[Extent]:
-        """Extents of the surfaces of some slots, which have points.
-
-        They may change the heading of the room.
-        """
+    def extents(self, slots: Int64, up: Sequence[float], heading: RoomHeading) -> list[Extent]:
+        """Extents of the surfaces of some slots, which have points, and vote for the heading."""
         nodes, shown = self._nodes, None if self._shown is None else self._shown(slots)
         known = nodes.surface_points_world, nodes.surface_counts, slots, up, shown
-        before = self.room_step
+        before = heading.step
         found = extents_of(*known, before)
         if shown is None:
             return found
-        for node_id, extent in zip(nodes.ids[slots].tolist(), found):
-            vote = cmath.rect(extent.side_m, 2.0 * math.pi * extent.step / HEADINGS)
-            self._vote(node_id, vote if extent.side_m >= MIN_VOTING_M else 0j)
-        if self.room_step == before:
-            return found
-        for ends in self._ends.values():
-            ends.due = 0
-        return extents_of(*known, self.room_step)
-
-    def forget(self, node_ids: Iterable[int]) -> None:
-        """Nodes that are gone have no say in the heading of the room."""
-        for node_id in node_ids:
-            self._vote(node_id, 0j)
-
-    def _vote(self, node_id: int, vote: complex) -> None:
-        old = self._votes.pop(node_id, 0j)
-        if vote:
-            self._votes[node_id] = vote
-        self._sum, self._most = self._sum + vote - old, self._most + abs(vote) - abs(old)
+        heading.vote(nodes.ids[slots].tolist(), found)
+        return found if heading.step == before else extents_of(*known, heading.step)
 
     def move(self, node_ids: Sequence[int], T_new_old: Float64) -> None:
         """Move the ends of boxes with their nodes, each by a rigid transform (n, 4, 4)."""
@@ -383,7 +388,12 @@ class NodeBoxes:
             return
         slots = np.unique(due)
         up = tuple(rounded(up_world(), POSITION_DECIMALS))
-        for slot, extent in zip(slots.tolist(), self.extents(slots, up)):
+        before = self._heading.step
+        extents = self.extents(slots, up, self._heading)
+        if self._heading.step != before:
+            for ends in self._ends.values():
+                ends.due = 0
+        for slot, extent in zip(slots.tolist(), extents):
             ends, node_id = Ends.of(extent.box), int(nodes.ids[slot])
             known, count = self._ends.get(node_id), int(nodes.observations[slot])
             if known is not None:
@@ -393,6 +403,7 @@ class NodeBoxes:
             wait = min(max(int(AGAIN_FRACTION * count), LEAST_FRAMES), MOST_FRAMES)
             ends.due, self._ends[node_id] = count + wait, ends
         if len(self._ends) > 2 * len(nodes) + FEW_POINTS:
+            self._heading.forget([i for i in self._ends if i not in nodes])
             self._ends = {i: ends for i, ends in self._ends.items() if i in nodes}
 
 
@@ -483,7 +494,8 @@ class NodeStates:
         self._stale: dict[int, None] = {}
         self.up: tuple[float, ...] = DEFAULT_UP
         self._up_world: Float64 | None = None
-        self._room_step: int | None = None
+        self._heading = RoomHeading()
+        self._step: int | None = None
 
     @property
     def new(self) -> int:
@@ -527,7 +539,7 @@ class NodeStates:
                 self._measured.pop(node_id, None)
                 self._stale.pop(node_id, None)
         self._touched.clear()
-        self._boxes.forget(gone)
+        self._heading.forget(gone)
         for node_id in take_first(self._new, new_at_most):
             present[node_id] = slot_of[node_id]
         extents = self._measure(present, at_most)
@@ -559,8 +571,8 @@ class NodeStates:
         extents: dict[int, Extent | None] = {}
         # All boxes that are measured may tell another heading of the room, and then are again.
         for _ in range(2 if at_most is None else 1):
-            if self._boxes.room_step != self._room_step:
-                self._room_step = self._boxes.room_step
+            if self._heading.step != self._step:
+                self._step = self._heading.step
                 self._stale.update(dict.fromkeys(sorted(self._measured)))
             due += take_first(self._stale, at_most)
             if not due:
@@ -568,7 +580,7 @@ class NodeStates:
             slots = nodes.slots_of(due)
             self._measured.update(zip(due, revisions[slots].tolist()))
             solid = nodes.surface_counts[slots] > 0
-            found = iter(self._boxes.extents(slots[solid], self.up))
+            found = iter(self._boxes.extents(slots[solid], self.up, self._heading))
             for node_id, has_points in zip(due, solid.tolist()):
                 extents[node_id] = next(found) if has_points else None
             due = []

@@ -200,7 +200,7 @@ def test_questions_are_answered_and_a_goal_is_published_on_request_only(robot, c
     assert goal["seen_free"] == 1.0 and goal["pose"]["position"]["y"] < 0
     assert goal["header"]["frame_id"] == "world" and goal["target"]["label"] == "cup"
     agent = GraphTools(lambda: client.graph, client)
-    assert robot.ask(agent.goal_near, "cup", 0.8) == goal
+    assert robot.ask(agent.go_to_goal, "cup", 0.8) == goal
     words = ("goal", "--live", "cup", "--distance", "0.8")
     assert "seen as free: 100%" in robot.command(*words)
     assert json.loads(robot.command(*words, "--json")) == goal
