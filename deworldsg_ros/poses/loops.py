@@ -476,7 +476,10 @@ class LoopOdometry:
         return Edges(np.array(a), np.array(b), T, sigmas, np.arange(len(T)) >= len(steps))
 
     def _thin(self) -> None:
-        """Leave out every second keyframe of the older half; its loops go to the one before."""
+        """Leave out every second keyframe of the older half; its loops go to the one before.
+
+        Of two loops between the same keyframes, the newer one stays.
+        """
         kept: list[_Keyframe] = []
         to: dict[int, _Keyframe] = {}
         for row, keyframe in enumerate(self._keyframes):
@@ -487,13 +490,13 @@ class LoopOdometry:
                 to[id(keyframe)] = kept[-1]
             else:
                 kept.append(keyframe)
-        loops = []
+        loops: dict[tuple[int, int], tuple[_Keyframe, _Keyframe, Float64]] = {}
         for a, b, T in self._loops:
             new_a, new_b = to.get(id(a), a), to.get(id(b), b)
             T = invert_pose(new_a.T) @ a.T @ T @ invert_pose(b.T) @ new_b.T
             if new_a is not new_b:
-                loops.append((new_a, new_b, T))
-        self._keyframes, self._loops = kept, loops
+                loops[id(new_a), id(new_b)] = new_a, new_b, T
+        self._keyframes, self._loops = kept, list(loops.values())
 
 
 def _grid(depth_m: Float32, intrinsics: Intrinsics) -> DepthGrid:
