@@ -1,6 +1,6 @@
 """What is left of a drift after a SLAM system closed its loop, and what following it costs.
 
-    python bench/slam.py [ROOMS --scan SCAN] [--quick]
+    python bench/slam.py [ROOMS --scan SCAN] [--quick | --picture OUT.webp]
 
 A camera goes through a room, and a third of the way again. Its poses drift by 1 m and 5 degrees.
 Then SLAM closes the loop: the graph gets the true poses of all frames. It is compared with a graph
@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "test")]
@@ -38,8 +39,13 @@ from deworldsg_ros.poses.drift import moved  # noqa: E402
 from deworldsg_ros.recordings.folders.annotations import Annotations  # noqa: E402
 from deworldsg_ros.recordings.recording import Recording, open_source  # noqa: E402
 from deworldsg_ros.scene.arrays import Float64  # noqa: E402
-from deworldsg_ros.scene.camera import invert_pose, rigid_motion  # noqa: E402
+from deworldsg_ros.scene.camera import (  # noqa: E402
+    invert_pose,
+    pose_from_quaternion,
+    rigid_motion,
+)
 from deworldsg_ros.scene.frame_graph import LocalGraph, derived  # noqa: E402
+from deworldsg_ros.view.colours import class_colours, to_rgb  # noqa: E402
 from deworldsg_ros.wire import messages as wire  # noqa: E402
 from deworldsg_ros.wire.follow import GraphReplica  # noqa: E402
 
@@ -215,6 +221,68 @@ def cost_ms(nodes: int, keyframes: int) -> tuple[float, float, float]:
     return 1e3 * times[0], 1e3 * max(times[1:]), 1e3 * sum(times)
 
 
+# The moving picture: metres across, pixels a metre, frames a step, and how long steps last.
+ACROSS_M, PX_PER_M, STEP_FRAMES, STEP_MS, LAST_MS = (9.0, 7.5), 80, 6, 120, 3500
+GREY, RED, INK = (205, 205, 205), (200, 40, 40), (30, 30, 30)
+
+
+def from_above(
+    graph: wire.SceneGraphMessage, true: wire.SceneGraphMessage, way: list[Float64], words: str
+) -> Image.Image:
+    """The objects of a graph from above, the true ones in grey, and the way of the camera."""
+    middle = np.mean([node.box.center_m[:2] for node in true.nodes], axis=0)
+    size = [round(PX_PER_M * metres) for metres in ACROSS_M]
+    image = Image.new("RGB", size, "white")
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(15)
+
+    def px(points: Float64) -> list[tuple[float, float]]:
+        flat = (np.asarray(points)[:, :2] - middle) * [PX_PER_M, -PX_PER_M] + np.array(size) / 2
+        return [(float(x), float(y)) for x, y in flat]
+
+    def corners(node: wire.NodeState) -> list[tuple[float, float]]:
+        R = pose_from_quaternion(np.zeros(3), np.array(node.box.orientation_xyzw))[:3, :3]
+        signs = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+        return px(node.box.center_m + (signs * np.array(node.box.size_m) / 2) @ R.T)
+
+    for node in true.nodes:
+        draw.polygon(corners(node), outline=GREY, width=4)
+    colours = class_colours([node.label for node in graph.nodes])
+    for node in graph.nodes:
+        colour = tuple(round(255 * part) for part in to_rgb(colours[node.label]))
+        draw.polygon(corners(node), outline=colour, width=2)
+        if max(node.box.size_m[:2]) > 0.4:
+            draw.text(px([node.box.center_m])[0], node.label, INK, font, anchor="mm")
+    draw.line(px(np.array(way)), RED, 2)
+    draw.text((12, 10), words, INK, ImageFont.load_default(20))
+    return image
+
+
+def picture(room: Room, out: Path) -> None:
+    """Write a moving picture of a loop that closes. The node's own correction is off."""
+    true, _ = run(room.frames, room.frames, "nothing")
+    frames, steps = drifting(room.frames), []
+    builder = GraphBuilder(Config(), frames[0].vocabulary, frames[0].frame_id)
+    builder._drift = None
+    way: list[Float64] = []
+    for number, frame in enumerate(frames):
+        builder.integrate(frame)
+        way.append(frame.T_world_camera[:3, 3])
+        if number % EVERY == 0:
+            builder.apply_trajectory(*trajectory(frames[: number + 1]))
+        if number % STEP_FRAMES == 0:
+            words = f"poses drift: {len(builder.full().nodes)} objects"
+            steps.append(from_above(builder.full(), true, way, words))
+    builder.apply_trajectory(*trajectory(room.frames))
+    builder.settle()
+    way = [frame.T_world_camera[:3, 3] for frame in room.frames]
+    words = f"SLAM closes its loop: {len(builder.full().nodes)} objects"
+    steps.append(from_above(builder.full(), true, way, words))
+    durations = [STEP_MS] * (len(steps) - 2) + [LAST_MS // 2, LAST_MS]
+    more = {"save_all": True, "append_images": steps[1:], "duration": durations, "loop": 0}
+    steps[0].save(out, "WEBP", quality=60, method=6, **more)
+    print(f"{out}: {len(steps)} steps, {out.stat().st_size / 1e6:.2f} MB")
+
+
 def figures(setup: Setup) -> list[Figure]:
     """Figures of `python -m bench`."""
     warm_up(Config())
@@ -244,7 +312,11 @@ def main() -> None:
     parser.add_argument("rooms", type=Path, nargs="?")
     parser.add_argument("--scan", default="")
     parser.add_argument("--quick", action="store_true", help="a small map and few frames")
+    parser.add_argument("--picture", type=Path, help="write a moving picture, no figures")
     options = parser.parse_args()
+    if options.picture is not None:
+        picture(read_room(options.rooms, options.scan), options.picture)
+        return
     if options.rooms is not None:
         report(read_room(options.rooms, options.scan))
         return
