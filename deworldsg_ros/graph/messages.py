@@ -471,6 +471,7 @@ class NodeStates:
 
     Attributes:
         up: unit vector against gravity, for the boxes.
+        heading: of the room, by the boxes of these messages.
         states: messages by id. Those of nodes that did not change are the same objects as before.
     """
 
@@ -494,7 +495,7 @@ class NodeStates:
         self._stale: dict[int, None] = {}
         self.up: tuple[float, ...] = DEFAULT_UP
         self._up_world: Float64 | None = None
-        self._heading = RoomHeading()
+        self.heading = RoomHeading()
         self._step: int | None = None
 
     @property
@@ -539,7 +540,7 @@ class NodeStates:
                 self._measured.pop(node_id, None)
                 self._stale.pop(node_id, None)
         self._touched.clear()
-        self._heading.forget(gone)
+        self.heading.forget(gone)
         for node_id in take_first(self._new, new_at_most):
             present[node_id] = slot_of[node_id]
         extents = self._measure(present, at_most)
@@ -571,8 +572,8 @@ class NodeStates:
         extents: dict[int, Extent | None] = {}
         # All boxes that are measured may tell another heading of the room, and then are again.
         for _ in range(2 if at_most is None else 1):
-            if self._heading.step != self._step:
-                self._step = self._heading.step
+            if self.heading.step != self._step:
+                self._step = self.heading.step
                 self._stale.update(dict.fromkeys(sorted(self._measured)))
             due += take_first(self._stale, at_most)
             if not due:
@@ -580,7 +581,7 @@ class NodeStates:
             slots = nodes.slots_of(due)
             self._measured.update(zip(due, revisions[slots].tolist()))
             solid = nodes.surface_counts[slots] > 0
-            found = iter(self._boxes.extents(slots[solid], self.up, self._heading))
+            found = iter(self._boxes.extents(slots[solid], self.up, self.heading))
             for node_id, has_points in zip(due, solid.tolist()):
                 extents[node_id] = next(found) if has_points else None
             due = []
