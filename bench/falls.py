@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools" / "physics_rooms"))
@@ -33,8 +34,9 @@ from deworldsg_ros.client.removal import Order, carriers_of
 from deworldsg_ros.graph.extent import box_of, even_moments
 from deworldsg_ros.scene.arrays import Bool, Float64
 from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import empty_scene_graph
 
-# Pairs of boxes that are farther apart are left out: nobody is wrong there.
+# Pairs whose boxes are farther apart count only if one falls, or is said to: the rest is too easy.
 REACH_M = 0.3
 # Where the graph has errors: of each face of a box, and the share of wrong supports.
 BOX_ERROR_M, WRONG_SUPPORTS = 0.01, 0.1
@@ -160,15 +162,7 @@ def graph_of(scene: Scene, seed: int, *, with_errors: bool) -> SceneGraph:
 
 
 def _message(nodes: list[wire.NodeState], edges: list[wire.EdgeState]) -> wire.SceneGraphMessage:
-    return wire.SceneGraphMessage(
-        schema=wire.schema_of(wire.SceneGraphMessage),
-        stamp=wire.stamp_from_ns(10**9),
-        frame_id="map",
-        sequence=1,
-        nodes=nodes,
-        edges=edges,
-        up=[0.0, 0.0, 1.0],
-    )
+    return replace(empty_scene_graph("map"), nodes=nodes, edges=edges, up=[0.0, 0.0, 1.0])
 
 
 def _node(item: Any, rng: np.random.Generator, error_m: float) -> wire.NodeState:

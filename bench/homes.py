@@ -9,12 +9,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from msgspec.structs import replace
 from support.spaces import looking
 
 from deworldsg_ros.graph.provenance import GREY, MAX_VIEWS, SeenSpace
 from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.scene.arrays import Bool, Float64, UInt16
 from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import empty_scene_graph
 
 WALL_M, CEILING_M, DOOR_M = 0.12, 2.5, 2.03
 CELL_M = 0.04
@@ -374,13 +376,9 @@ def nodes_of(made: Home, seed: int, first_id: int = 1) -> list[wire.NodeState]:
 
 def graph_of(nodes: list[wire.NodeState], rooms: RoomMap) -> wire.SceneGraphMessage:
     """The message of a graph with these objects and rooms."""
-    return wire.SceneGraphMessage(
-        schema=wire.schema_of(wire.SceneGraphMessage),
-        stamp=wire.stamp_from_ns(10**9),
-        frame_id="map",
-        sequence=1,
+    return replace(
+        empty_scene_graph("map"),
         nodes=nodes,
-        edges=[],
         up=[0.0, 0.0, 1.0],
         rooms=rooms.states(nodes),
         storeys_m=rooms.floors_m,

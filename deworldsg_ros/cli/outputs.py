@@ -359,7 +359,7 @@ def as_report(findings: Sequence[Finding]) -> list[dict[str, Any]]:
     return [asdict(finding) for finding in findings]
 
 
-# --- Frames of a recording, of which the photos of objects are cut.
+# --- The frames of a recording that photos of objects are cut from.
 
 # Frames of a recording that are kept: 64 MB, and at least as many as a walk around a room needs.
 MOST_BYTES, LEAST_FRAMES = 64 << 20, 8

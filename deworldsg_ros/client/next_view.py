@@ -45,7 +45,7 @@ from deworldsg_ros.wire import messages as wire
 STEP_M, MOST_PLACES = 0.5, 250
 # A new object tells so much: that it exists, and its name. Nats.
 NEW_NATS = 4.0
-# Before anything was seen: so many objects in so many cubic metres.
+# The density of objects to begin with: as if PRIOR had been seen in PRIOR_M3 cubic metres.
 PRIOR, PRIOR_M3 = 4.0, 20.0
 # Small objects that a view from afar has missed are within so much of a surface.
 MISSED_M = 0.3
@@ -416,7 +416,7 @@ def views_from(chosen: Int64, reached: Reach, looks: Looks, items: Items) -> Vie
 def _relations(
     at: Int64, rows: Int64, new: Float64, in_view: Bool, items: Items
 ) -> tuple[Int64, Bool, Float64, Int64]:
-    """The uncertain relations of which both ends are in view: see `Views.parts`."""
+    """What views tell of uncertain relations, with both objects in view; as `Views.parts`."""
     count = len(items.ids) + 1
     keys = at * count + rows  # ascending
     found = []
