@@ -13,6 +13,7 @@ from raster import Triangles
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from bench.furnished import pose
 from deworldsg_ros.graph.floor_plan import fans, rays_of
 from deworldsg_ros.poses.trajectory import Perturbation, PoseNoise
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, invert_pose, rigid_motion
@@ -32,18 +33,7 @@ CORRECTED_EVERY_M, REST_M, REST_RAD = 3.0, 0.02, math.radians(0.4)
 
 def looking(x: float, y: float, yaw: float) -> np.ndarray:
     """T_world_camera (4, 4) of the robot's camera when the robot is at a pose."""
-    ahead = np.array(
-        [
-            math.cos(yaw) * math.cos(TILT_RAD),
-            math.sin(yaw) * math.cos(TILT_RAD),
-            -math.sin(TILT_RAD),
-        ]
-    )
-    right = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
-    T[:3, 3] = x, y, CAMERA_M
-    return T
+    return pose(x, y, CAMERA_M, yaw, TILT_RAD)
 
 
 def plan_pose(T_world_camera: np.ndarray) -> np.ndarray:
