@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.base.array_file import Arrays
+from deworldsg_ros.graph.extent import even_moments
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging import beliefs, surface_map
@@ -324,6 +325,38 @@ class NodeRecords:
         self._add_cells(kept, cells, scores)
         self.place(graph, [kept])
 
+    def keep_largest(self, graph: GlobalGraph, slot: int, surfaces: Sequence[Float32]) -> bool:
+        """Leave a node the largest of the parts that are nearest to each of several surfaces.
+
+        Args:
+            graph: changed.
+            slot: of the node.
+            surfaces: (k, 3) metres, one of each object.
+
+        Returns:
+            Whether there were other parts.
+        """
+        nodes, surface = graph.nodes, graph.nodes.surface(slot)
+        parts = _nearest(surface, surfaces)
+        kept = int(np.bincount(parts).argmax())
+        self.joint.forget_several(slot)
+        own = parts == kept
+        if own.all():
+            return False
+        mean, covariance = even_moments(surface[own])
+        weight = float(nodes.weights[slot]) * np.count_nonzero(own) / len(own)
+        classes = nodes.class_probabilities[slot].copy()
+        nodes.put(slot, mean, covariance, classes, weight, int(nodes.observations[slot]))
+        dropped = np.zeros((1, nodes.surface_points_world.shape[1]), np.bool_)
+        dropped[0, : len(own)] = ~own
+        graph.drop_points([self.node(slot)], dropped)
+        slots = np.array([slot])
+        of, centres, scores = self.map.take(slots)
+        own = _nearest(centres, surfaces) == kept
+        self.map.put(slots, of[own], centres[own], scores[own])
+        self.place(graph, slots)
+        return True
+
     def memory(self) -> Arrays:
         """The records as arrays by name, for `restore`; equal records give equal arrays."""
         from numpy.lib.recfunctions import repack_fields  # slow to import, and only for maps
@@ -393,6 +426,18 @@ class NodeRecords:
     def _make_room(self, count: int) -> None:
         while len(self.rows) < count:
             self.rows = np.concatenate((self.rows, np.zeros_like(self.rows)))
+
+
+def _nearest(points: Float32, surfaces: Sequence[Float32]) -> Int64:
+    """Which of several surfaces (k, 3) is nearest to each point (n, 3): (n,)."""
+    # A tree takes a second to import. Near the origin, the squares do not cancel.
+    origin = surfaces[0].mean(axis=0, dtype=np.float64)
+    points, squared = points - origin, np.empty((len(surfaces), len(points)))
+    for index, surface in enumerate(surfaces):
+        others = surface - origin
+        squared[index] = ((others**2).sum(axis=1) - 2 * points @ others.T).min(axis=1)
+    nearest: Int64 = squared.argmin(axis=0)
+    return nearest
 
 
 # A cell moves with a surface point in its cube of this size. Odd factors hash node and cube.

@@ -26,7 +26,13 @@ from deworldsg_ros.merging.editing import (
     reject_deleted,
 )
 from deworldsg_ros.merging.life_cycle import LifeCycle
-from deworldsg_ros.merging.matching import Matches, in_one_place, match, match_nodes
+from deworldsg_ros.merging.matching import (
+    Matches,
+    in_one_place,
+    match,
+    match_nodes,
+    several_on_one,
+)
 from deworldsg_ros.merging.records import NodeRecords, move_nodes
 from deworldsg_ros.merging.views import FrameArrays, View, frame_arrays, see, see_nothing, with_seen
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
@@ -108,6 +114,8 @@ class SurfaceMerging:
             frame = frame_arrays(invert_pose(local.T_world_camera), local.depth_grid)
         view = self._see(graph, local, frame)
         matches = self._associate(graph, local, cells, view)
+        if self._cut(graph, local, matches):
+            matches = self._associate(graph, local, cells, view)
         node_ids = self._update(graph, local, cells, matches)
         self._judge_cells(graph, local, cells, node_ids, frame)
         node_ids = self._merge_parts(graph, local, matches, node_ids, view.slots)
@@ -198,6 +206,16 @@ class SurfaceMerging:
             self._config.overlap_threshold,
             records.map.cell_m,
         )
+
+    def _cut(self, graph: GlobalGraph, local: LocalGraph, matches: Matches) -> bool:
+        """Cut the nodes that viewpoints enough have shown as several objects; were there any?"""
+        records, found = self._records, False
+        for column, rows in several_on_one(local, matches):
+            slot = int(matches.slots[column])
+            if records.joint.are_several(slot, local.T_world_camera[:3, 3]):
+                surfaces = [local.surface_points_world[row] for row in rows]
+                found |= records.keep_largest(graph, slot, surfaces)
+        return found
 
     def _update(
         self, graph: GlobalGraph, local: LocalGraph, cells: CellSets, matches: Matches
