@@ -22,6 +22,7 @@ from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.merging import SurfaceMerging
 from deworldsg_ros.merging.matching import in_one_place
+from deworldsg_ros.merging.records import _nearest
 from deworldsg_ros.merging.surface_map import CELL_M
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 
@@ -156,9 +157,7 @@ def test_two_that_viewpoints_have_shown_together_are_two(scene, viewpoints, are_
     """A chair in the place of another one, as a mask that takes in both makes it."""
     back = slab((0.2, 0, 0.8), (0.05, 0.45, 0.3))
     for index in range(viewpoints):
-        pose = np.eye(4)
-        pose[0, 3] = 0.3 * index
-        scene.see((SEAT, CHAIR), (back, CHAIR), times=2, T_world_camera=pose)
+        scene.see((SEAT, CHAIR), (back, CHAIR), times=2, T_world_camera=at(0.3 * index))
     scene.graph.up_world = np.array((0.0, 0.0, 1.0))
     joint = scene.merging._records.joint
     assert in_one_place(scene.graph, [0], np.array([1])) == [(0, 1)]
@@ -173,6 +172,64 @@ def test_a_node_of_two_objects_loses_the_surface_of_one_when_both_are_detected(s
     assert scene.see((right, CUP), make=view) == [2] and scene.see((left, CUP), make=view) == [1]
     # Its surface ends within two cells of the other object, which extends to 0.12 m.
     assert scene.graph.nodes.surface(0)[:, 0].max() < 2 * CELL_M
+
+
+def at(x_m: float) -> np.ndarray:
+    """A pose of the camera."""
+    pose = np.eye(4)
+    pose[0, 3] = x_m
+    return pose
+
+
+NEAR_CHAIR, FAR_CHAIR = slab((-0.4, 0, 1), (0.5, 0.5, 0.04)), slab((0.4, 0, 1.3), (0.4, 0.5, 0.04))
+BOXES = {
+    "apart": [[100, 100, 200, 300], [220, 100, 300, 300]],
+    "nested": [[100, 100, 200, 300]] * 2,
+}
+
+
+@pytest.mark.parametrize(
+    ("boxes", "score", "poses_m", "cut"),
+    [
+        ("apart", 0.8, (0.0, 0.1, 0.3), True),
+        ("apart", 0.8, (0.0, 0.1, 0.15), False),  # one viewpoint says once
+        ("apart", 0.4, (0.0, 0.1, 0.3), False),  # unsure
+        ("nested", 0.8, (0.0, 0.1, 0.3), False),  # a second box on an object
+    ],
+)
+def test_a_node_of_two_chairs_is_cut_when_viewpoints_show_both(
+    scene, boxes, score, poses_m, cut
+) -> None:
+    scene.see((np.concatenate((NEAR_CHAIR, FAR_CHAIR)), CHAIR), times=5)
+    changes = {"scores": np.array([0.9, score]), "boxes_xyxy": np.array(BOXES[boxes], np.float64)}
+    for x_m in poses_m:
+        pose = at(x_m)
+        ids = scene.see((NEAR_CHAIR, CHAIR), (FAR_CHAIR, CHAIR), T_world_camera=pose, **changes)
+    nodes, records = scene.graph.nodes, scene.merging._records
+    surface, cells = nodes.surface(0), records.map.centres(0)
+    assert ids[0] == 1 and ids[1] > 1
+    if cut:
+        # Surface, cells and Gaussian are those of the nearer chair alone.
+        assert max(surface[:, 0].max(), cells[:, 0].max()) < 0
+        assert abs(nodes.means[0, 0] + 0.4) < 0.05 and nodes.covariances[0, 0, 0] < 0.15**2
+        assert scene.see((FAR_CHAIR, CHAIR)) == [ids[1]]
+        assert records.joint.balance(0, nodes.slot(ids[1])) < 0
+    else:
+        assert surface[:, 0].max() > 0.4 and cells[:, 0].max() > 0.4
+
+
+def test_each_point_goes_to_the_nearest_surface() -> None:
+    """As the slow, obvious way finds it, far from the origin."""
+    generator = np.random.default_rng(5)
+    points, *surfaces = (
+        (generator.random((count, 3)) + (1e3, -2e3, 5.0)).astype(np.float32)
+        for count in (200, 1, 30, 60)
+    )
+    distances = [
+        np.linalg.norm(points[:, None].astype(float) - surface, axis=2).min(axis=1)
+        for surface in surfaces
+    ]
+    assert (_nearest(points, surfaces) == np.argmin(distances, axis=0)).all()
 
 
 CHAIR_FRONT = slab((0, 0, 1), (0.5, 0.6, 0.004))
