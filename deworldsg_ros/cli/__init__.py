@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import signal
 import sys
 
@@ -13,6 +14,8 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    # As the nodes do; see `deworldsg_ros.nodes`.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         # The import takes a second: Ctrl-C may come during it, too. So nothing is imported above.
         from deworldsg_ros.cli.app import app

@@ -52,3 +52,6 @@ def start(name: str) -> NoReturn:
 
 # Before the modules of a node: the threads that numpy and numba start take heaps of their own.
 keep_freed_memory()
+# Products of matrices are small here. A second thread of OpenBLAS waits busily for the next one,
+# which takes the processor from the network. A value of the user stays.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -152,3 +152,23 @@ def test_all_threads_of_a_node_use_one_heap():
 
     assert heaps("") >= 4
     assert heaps("import deworldsg_ros.nodes") == 0
+
+
+PRODUCT = """
+import os
+import deworldsg_ros.nodes
+import numpy
+numbers = numpy.ones((300, 300))
+numbers @ numbers
+print(len(os.listdir("/proc/self/task")))
+"""
+
+
+@pytest.mark.skipif(platform.system() != "Linux", reason="threads are counted in /proc")
+def test_products_of_matrices_start_no_thread():
+    environment = {name: value for name, value in os.environ.items() if "_NUM_THREADS" not in name}
+    command = [sys.executable, "-c", PRODUCT]
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=60, check=True
+    )
+    assert done.stdout.split() == ["1"]
