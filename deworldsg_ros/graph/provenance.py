@@ -467,17 +467,16 @@ class Trail:
         T_new_old = np.where((frames >= since_ns)[:, None, None], T_new_old, np.eye(4))
         self._poses[: self._count] = T_new_old @ self._poses[: self._count]
         of = np.clip(frames.searchsorted(starts, "right") - 1, 0, None)
-        by_number = np.broadcast_to(np.eye(4), (len(starts) + 1, 4, 4)).copy()
-        of_poses = by_number.copy()
+        by_number, of_poses = np.tile(np.eye(4), (2, len(starts) + 1, 1, 1))
         own = np.flatnonzero((starts >= since_ns) & (starts >= frames[:1]))
         if len(own):
-            # The part that the correction of drift has moved it by already is taken back.
+            counts = np.maximum(np.diff(of, append=len(frames)), 1)[:, None, None]
+            means = (np.add.reduceat(T_new_old, of, axis=0) / counts)[own]
             drifts = np.array([self._T_graph_poses[number] for number in own.tolist()])
-            drifts[:, :3, :3] = nearest_rotations(drifts[:, :3, :3])
-            of_poses[own + 1] = T_new_old[of[own]]
-            by_number[own + 1] = of_poses[own + 1] @ invert_poses(drifts)
-        for number in own.tolist():
-            self._T_graph_poses[number] = np.eye(4)
+            for T in (means, drifts):  # of the keyframe's frames; drifts have moved them already
+                T[:, :3, :3] = nearest_rotations(T[:, :3, :3])
+            of_poses[own + 1], by_number[own + 1] = means, means @ invert_poses(drifts)
+            self._T_graph_poses[own[0] :] = [np.eye(4)] * len(own)  # all from the first on
         self._starts_anew = True
         return TrailChange(starts, by_number, of_poses)
 

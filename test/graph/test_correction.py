@@ -133,11 +133,12 @@ def test_what_was_seen_follows_a_trajectory_of_the_camera_or_of_its_body(every, 
     # The correction of drift had moved the frames, too.
     places = places_after(change, stamps, T_drift @ wrong)
     expected = (true @ np.array([0, 0, 2.0, 1.0]))[:, :3]
-    # Frames of a keyframe share its pose: within it, the drift goes on.
-    assert np.linalg.norm(places - expected, axis=1).max() < 0.03
+    # Frames of a keyframe share its pose, which is right for their mean: within it, drift goes on.
+    errors = places - expected
+    assert np.linalg.norm(errors, axis=1).max() < (0.03 if every > 1 else 0.01)
     starts = change.starts_ns
-    at = np.isin(stamps, starts)
-    np.testing.assert_allclose(places[at], expected[at], atol=0.02 if every > 1 else 1e-6)
+    for part in np.split(errors, stamps.searchsorted(starts[1:])):
+        assert np.linalg.norm(part.mean(axis=0)) < (0.03 if every > 1 else 0.001)
     assert trail.follow(stamps[::every], bodies[1][::every]) is None
     # And back again: now no drift is taken back.
     back = trail.follow(stamps[::every], bodies[0][::every])
@@ -332,6 +333,20 @@ def test_a_node_that_was_seen_before_and_after_moves_piece_by_piece() -> None:
     nodes, slot = builder.graph.nodes, builder.graph.nodes.slot(1)
     np.testing.assert_allclose(nodes.means[slot], [0, 0, 1], atol=0.02)
     np.testing.assert_allclose(nodes.covariances[slot], np.cov(points.T), atol=2e-3)
+
+
+def test_what_was_seen_before_a_correction_outlasts_the_frames_after_it() -> None:
+    builder = builder_of("surface")
+    for second in range(1, 21):
+        builder.integrate(slab_at(second * S, 0.0, seed=second))
+    builder.apply_correction(shift(2.0), S)
+    for second in range(21, 24):  # then its right half is in view
+        slab = slab_at(second * S, 2.0, seed=second)
+        half = slab.surface_points_world[0][slab.surface_points_world[0][:, 0] > 2.0]
+        assert builder.integrate(derived(slab, surface_points_world=(half,))) == [1]
+    points = surface_points(states(builder)[1])
+    # 20 frames of a half of the slab against 23 of the other.
+    assert 0.4 < np.mean(points[:, 0] < 2.0) < 0.5
 
 
 @BOTH
