@@ -250,7 +250,7 @@ def over_drifts(room: Room, seeds: range) -> None:
         rows.append(row)
         print(seed, *(f"{value:.1f}" for values in row for value in values), flush=True)
     table = np.array(rows)
-    spread, lost = table.std(axis=0, ddof=1), table[:, 0] - table[:, 1:]
+    spread, lost = table.std(axis=0, ddof=1), table[:, :1] - table[:, 1:]
     print(
         "way: relations found, per cent; error of extents, cm; median way from the true place, cm"
     )
