@@ -306,19 +306,16 @@ def edit(
     takes two points, X,Y,Z each: every part of the object belongs to the nearer one. `follow FILE`
     moves a map file as a trajectory in the TUM format says, which SLAM has corrected.
     """
-    rest = words if live else words[1:]
-    request = parse_edit(rest) if live or rest[:1] != ["follow"] or len(rest) != 2 else None
-    if live and request is not None:
-        reply = _edit_live(namespace, rest[0], request)
+    if live:
+        reply = _edit_live(namespace, words[0], parse_edit(words))
     else:
         from deworldsg_ros import map_file  # with all stages: slow to import
 
-        path = Path(words[0])
-        changed = (
-            map_file.follow_trajectory(path, Path(rest[1]))
-            if request is None
-            else map_file.edit_map(path, request)
-        )
+        path, rest = Path(words[0]), words[1:]
+        if rest[:1] == ["follow"] and len(rest) == 2:
+            changed = map_file.follow_trajectory(path, Path(rest[1]))
+        else:
+            changed = map_file.edit_map(path, parse_edit(rest))
         reply = msgspec.to_builtins(changed)
     if as_json:
         print_json(reply)
