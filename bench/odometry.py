@@ -1,9 +1,14 @@
 """Error and time of RGB-D odometry on a recording with true poses.
 
-    python bench/odometry.py RECORDING [--max-frames N]
+    python bench/odometry.py RECORDING [--max-frames N] [--then OTHER ...]
 
 It compares three trajectories: by odometry from frame to frame, aligned with the map as each frame
 came, and after the loops were closed. All begin at the first true pose.
+
+With --then, the camera is carried from the recording to other places, one at a time: all loops
+between both are false. One place more is the recording itself in a mirror: the same walls, floors
+and things at other angles. A try is a frame that is lost, or a keyframe, and is compared with what
+was seen in the first place.
 """
 
 from __future__ import annotations
@@ -11,6 +16,9 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterable, Iterator
+from copy import deepcopy
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -21,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from deworldsg_ros.poses.loops import LoopOdometry, closings_in_words
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.camera import rotation_angle_deg
+from deworldsg_ros.scene.camera import RgbdFrame, rotation_angle_deg
 from deworldsg_ros.scene.errors import RefusedInput
 
 
@@ -35,11 +43,64 @@ def report(name: str, poses: Float64, true: Float64) -> None:
     )
 
 
+def mirrored(frames: Iterable[RgbdFrame]) -> Iterator[RgbdFrame]:
+    """The frames in a mirror; their poses are not changed."""
+    for frame in frames:
+        camera = frame.intrinsics
+        yield replace(
+            frame,
+            rgb=np.ascontiguousarray(frame.rgb[:, ::-1]),
+            depth_m=np.ascontiguousarray(frame.depth_m[:, ::-1]),
+            intrinsics=replace(camera, cx=camera.width - 1 - camera.cx),
+        )
+
+
+def false_loops(odometry: LoopOdometry, frames: Iterable[RgbdFrame]) -> tuple[int, int]:
+    """Tries, and false loops, of a camera that is carried to another place.
+
+    Args:
+        odometry: of the first place; not changed.
+        frames: of the other one.
+    """
+    odometry, tries = deepcopy(odometry), 0
+    last_ns = odometry.keyframes_ns[-1]
+    for number, frame in enumerate(frames, start=1):
+        known, stamp_ns = len(odometry.keyframes_ns), last_ns + number * 10**8
+        try:
+            odometry.track(stamp_ns, frame.rgb, frame.depth_m, frame.intrinsics)
+        except RefusedInput:
+            tries += 1
+            continue
+        tries += len(odometry.keyframes_ns) > known
+    return tries, sum(a <= last_ns < b for a, b in odometry.loops_ns)
+
+
+def report_strangers(first: Path, others: list[Path], most: int) -> None:
+    """Print the false loops between a recording and others."""
+    odometry: LoopOdometry | None = None
+    for frame in islice(open_recording(first).frames(), most):
+        odometry = odometry or LoopOdometry(frame.T_world_camera)
+        try:
+            odometry.track(frame.stamp_ns, frame.rgb, frame.depth_m, frame.intrinsics)
+        except RefusedInput:
+            continue
+    assert odometry is not None
+    for other in [first, *others]:
+        frames = islice(open_recording(other).frames(), most)
+        tries, found = false_loops(odometry, mirrored(frames) if other == first else frames)
+        name = "a mirror" if other == first else other
+        print(f"{first}, then {name}: {tries} tries, {found} false loops", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recording", type=Path)
     parser.add_argument("--max-frames", type=int, default=0, help="0 = all")
+    parser.add_argument("--then", type=Path, nargs="+", help="other places: count false loops")
     options = parser.parse_args()
+    if options.then:
+        report_strangers(options.recording, options.then, options.max_frames or sys.maxsize)
+        return
     recording = open_recording(options.recording)
     odometry: LoopOdometry | None = None
     stamps_ns, times_ms = list[int](), list[float]()

@@ -6,7 +6,7 @@ frames everything comes, the space that the camera saw as free, and its rooms.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +33,9 @@ from deworldsg_ros.graph.provenance import FrameMemory, SeenFrames
 from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
 from deworldsg_ros.merging.editing import EditReply
+from deworldsg_ros.poses.trajectory import read_trajectory
 from deworldsg_ros.relations.paper import ClassPairPrior, PriorState
+from deworldsg_ros.scene.arrays import Int64
 from deworldsg_ros.scene.checks import checked, holds
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
@@ -242,27 +244,77 @@ def edit_map(path: Path, request: GraphEdit) -> EditReply:
         ConfigurationError: if the file is no map, or cannot be written.
         RefusedInput: ``invalid_request``, with the reason; the file is unchanged.
     """
+    try:  # a request that was made without its limits would be in the map
+        request = msgspec.convert(msgspec.to_builtins(request), type(request))
+    except msgspec.ValidationError as error:
+        raise RefusedInput("invalid_request", str(error)) from error
+    with _changing(path) as builder:
+        return builder.edit(request)
+
+
+def follow_trajectory(path: Path, trajectory_path: Path) -> EditReply:
+    """Move a map as a trajectory that SLAM has corrected says; the map before it stays.
+
+    Args:
+        path: the map.
+        trajectory_path: TUM file with poses of the camera in the frame of the map.
+
+    Raises:
+        ConfigurationError: if the file is no map, or cannot be written, or the trajectory is of
+            another time; the map is unchanged.
+        TrajectoryError: if the trajectory cannot be read.
+    """
+    known = read_trajectory(trajectory_path, "tum")
+    stamps_ns = np.array(known.keys, np.int64)
+    with _changing(path) as builder:
+        nodes = builder.graph.nodes
+        if not builder.trail.keyframe:
+            raise ConfigurationError(
+                f"map {path} has no poses of its frames: expected a map of this release"
+            )
+        seen_ns = [int(nodes.first_seen_ns[nodes.slots].min(initial=2**62)), builder.newest_ns]
+        if stamps_ns[-1] < seen_ns[0] or stamps_ns[0] > seen_ns[1]:
+            raise ConfigurationError(
+                f"trajectory {trajectory_path} has poses {_span(stamps_ns)}, and map {path} frames "
+                f"{_span(seen_ns)}: expected stamps of one clock"
+            )
+        before = {node_id: nodes.means[slot].copy() for node_id, slot in nodes.slot_of.items()}
+        builder.trail.T_body_camera = np.eye(4)
+        builder.apply_trajectory(stamps_ns, known.T_world_cameras)
+        builder.settle()
+        builder.find_rooms()
+        after = {node_id: nodes.means[slot] for node_id, slot in nodes.slot_of.items()}
+        steps_m = [float(np.linalg.norm(after[i] - before[i])) for i in after]
+    moved = sum(step_m > 0 for step_m in steps_m)
+    text = f"{counted(moved, 'object')} moved, by up to {max(steps_m, default=0.0):.2f} m"
+    if len(before) > len(after):
+        text += f"; {len(before) - len(after)} merged with others that they met"
+    return EditReply("follow", [], text)
+
+
+def _span(stamps_ns: Sequence[int] | Int64) -> str:
+    return f"from {stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s"
+
+
+@contextmanager
+def _changing(path: Path) -> Iterator[GraphBuilder]:
+    """The graph of a map, which is written at the end; after an error, the map is as it was."""
     if not path.is_file():
         what = "a folder, and " if path.is_dir() else ""
         raise ConfigurationError(
             f"map {path} is {what}no map: expected a file that graph_node (map_path) or `deworldsg "
             "run RECORDING --out OUT --map FILE` has written"
         )
-    try:  # a request that was made without its limits would be in the map
-        request = msgspec.convert(msgspec.to_builtins(request), type(request))
-    except msgspec.ValidationError as error:
-        raise RefusedInput("invalid_request", str(error)) from error
     lock = claim_map(path)
     try:
         of_paper = MergingConfig(association="paper")
         merging = MergingConfig() if _is_of_surface_rule(path) else of_paper
         builder = read_map(Config(merging=merging), path)
         builder.graph.skip_to(first_id(path))
-        reply = builder.edit(request)
+        yield builder
         write_map(builder, path)
     finally:
         lock.release()
-    return reply
 
 
 def _is_of_surface_rule(path: Path) -> bool:

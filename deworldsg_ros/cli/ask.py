@@ -293,7 +293,7 @@ EditLive = Annotated[
 
 USAGE = (
     "set_label ID LABEL, merge ID ID, split ID [X,Y,Z X,Y,Z], delete ID, name_room ID [NAME], or "
-    "undo, after the map file or --live"
+    "undo, after the map file or --live; or follow TRAJECTORY, after the map file"
 )
 
 
@@ -303,16 +303,20 @@ def edit(
     """Edit a map: set_label ID LABEL, merge ID ID, split ID, delete ID, name_room ID NAME, undo.
 
     With --live, the graph of the running graph_node. An edit holds for all later frames. `split`
-    takes two points, X,Y,Z each: every part of the object belongs to the nearer one.
+    takes two points, X,Y,Z each: every part of the object belongs to the nearer one. `follow FILE`
+    moves a map file as a trajectory in the TUM format says, which SLAM has corrected.
     """
-    path, rest = (None, words) if live else (Path(words[0]), words[1:])
-    request = parse_edit(rest)
-    if path is None:
-        reply = _edit_live(namespace, rest[0], request)
+    if live:
+        reply = _edit_live(namespace, words[0], parse_edit(words))
     else:
-        from deworldsg_ros.map_file import edit_map  # with all stages: slow to import
+        from deworldsg_ros import map_file  # with all stages: slow to import
 
-        reply = msgspec.to_builtins(edit_map(path, request))
+        path, rest = Path(words[0]), words[1:]
+        if rest[:1] == ["follow"] and len(rest) == 2:
+            changed = map_file.follow_trajectory(path, Path(rest[1]))
+        else:
+            changed = map_file.edit_map(path, parse_edit(rest))
+        reply = msgspec.to_builtins(changed)
     if as_json:
         print_json(reply)
     else:

@@ -21,7 +21,7 @@ from deworldsg_ros.scene.gaussian import (
     log_determinant,
     log_determinants,
 )
-from deworldsg_ros.scene.surface import add_flat, add_points, drop_points
+from deworldsg_ros.scene.surface import add_flat, add_points, drop_points, greatest_hashes
 
 # --- The ids of nodes over the life of a graph, and the nodes of past frames.
 
@@ -437,10 +437,11 @@ class NodeTable:
         old, T = points.astype(np.float64), T_new_old[keyframes]
         new = (T[:, :3, :3] @ old[:, :, None])[:, :, 0] + T[:, :3, 3]
         main = self._move_gaussians(slots, T_new_old, keyframes, starts, (old, new))
+        greatest = greatest_hashes(self.surface_points_world, self.surface_counts, slots)
         self.surface_counts[slots] = 0
         self.surface_revisions[slots] += 1
         samples = self.surface_points_world, self.surface_keyframes, self.surface_counts
-        add_flat(samples, slots, new.astype(np.float32), keyframes, starts)
+        add_flat(samples, slots, new.astype(np.float32), keyframes, starts, greatest)
         return main
 
     def _move_gaussians(

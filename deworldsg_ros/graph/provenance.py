@@ -255,6 +255,7 @@ class Trail:
     Attributes:
         keyframe: number of the present keyframe; 0 before the first frame.
         is_changing: whether poses of the trajectory before the last change may still come.
+        T_body_camera: (4, 4) how a trajectory's body carries the camera; None = to be learned.
     """
 
     def __init__(self) -> None:
@@ -267,7 +268,7 @@ class Trail:
         self._starts_ns: list[int] = []
         self._T_graph_poses: list[Float64] = []
         self._starts_anew, self._start, self._frames = True, np.eye(4), 0
-        self._T_body_camera: Float64 | None = None
+        self.T_body_camera: Float64 | None = None
         # Of poses on their way: the change, until when they come, and the last pose before.
         self._coming = np.eye(4), 0, np.eye(4)
         self._T_graph_world, self._placed_ns = np.eye(4), -1
@@ -371,14 +372,14 @@ class Trail:
             return None
         stamps_ns, bodies = stamps_ns[near], self._T_graph_world @ T_world_body[near]
         given = interpolate_poses(frames, self._poses[: self._count], stamps_ns)
-        if self._T_body_camera is None:
-            self._T_body_camera = _mounting(bodies, given)
-        if self._T_body_camera is None:
+        if self.T_body_camera is None:
+            self.T_body_camera = _mounting(bodies, given)
+        if self.T_body_camera is None:
             return None
-        new = bodies @ self._T_body_camera
+        new = bodies @ self.T_body_camera
         if np.linalg.norm(_marks(new) - _marks(given), axis=-1).max() < CHANGED_M:
             known = _mounting(bodies, given)  # more poses tell more exactly
-            self._T_body_camera = self._T_body_camera if known is None else known
+            self.T_body_camera = self.T_body_camera if known is None else known
             return None
         knots = self._knots(stamps_ns, new @ invert_poses(given))
         T = interpolate_poses(*knots, frames)
@@ -467,17 +468,16 @@ class Trail:
         T_new_old = np.where((frames >= since_ns)[:, None, None], T_new_old, np.eye(4))
         self._poses[: self._count] = T_new_old @ self._poses[: self._count]
         of = np.clip(frames.searchsorted(starts, "right") - 1, 0, None)
-        by_number = np.broadcast_to(np.eye(4), (len(starts) + 1, 4, 4)).copy()
-        of_poses = by_number.copy()
+        by_number, of_poses = np.tile(np.eye(4), (2, len(starts) + 1, 1, 1))
         own = np.flatnonzero((starts >= since_ns) & (starts >= frames[:1]))
         if len(own):
-            # The part that the correction of drift has moved it by already is taken back.
+            counts = np.maximum(np.diff(of, append=len(frames)), 1)[:, None, None]
+            means = (np.add.reduceat(T_new_old, of, axis=0) / counts)[own]
             drifts = np.array([self._T_graph_poses[number] for number in own.tolist()])
-            drifts[:, :3, :3] = nearest_rotations(drifts[:, :3, :3])
-            of_poses[own + 1] = T_new_old[of[own]]
-            by_number[own + 1] = of_poses[own + 1] @ invert_poses(drifts)
-        for number in own.tolist():
-            self._T_graph_poses[number] = np.eye(4)
+            for T in (means, drifts):  # of the keyframe's frames; drifts have moved them already
+                T[:, :3, :3] = nearest_rotations(T[:, :3, :3])
+            of_poses[own + 1], by_number[own + 1] = means, means @ invert_poses(drifts)
+            self._T_graph_poses[own[0] :] = [np.eye(4)] * len(own)  # all from the first on
         self._starts_anew = True
         return TrailChange(starts, by_number, of_poses)
 

@@ -367,6 +367,16 @@ class LoopOdometry:
         self.direct, self._T, self._restarts = T_odometry, T, self.odometry.restarts
         return T, closing
 
+    @property
+    def keyframes_ns(self) -> list[int]:
+        """The stamps of the keyframes."""
+        return [keyframe.stamp_ns for keyframe in self._keyframes]
+
+    @property
+    def loops_ns(self) -> list[tuple[int, int]]:
+        """The stamps of both keyframes of each loop, the older one first."""
+        return [(a.stamp_ns, b.stamp_ns) for a, b, _ in self._loops]
+
     def _found_again(self, grid: DepthGrid) -> _Keyframe | None:
         """Go on from a lost frame that shows what was seen before, and from when; None if not."""
         for T in self._recognised(self._T, self._keyframes, True):
@@ -455,8 +465,7 @@ class LoopOdometry:
         self._map.rows[seen, 7] = self._map.frame
         self.closed, self._since = self.closed + 1, 0
         self.correction_m = float(np.linalg.norm((newest.T - T_old)[:3, 3]))
-        stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes])
-        return Trajectory(stamps_ns, after, T_new_old)
+        return Trajectory(np.array(self.keyframes_ns), after, T_new_old)
 
     def _edges(self) -> Edges:
         from scipy.spatial.transform import Rotation

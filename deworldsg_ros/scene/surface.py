@@ -21,7 +21,9 @@ from deworldsg_ros.scene.arrays import Bool, Float32, Int64, UInt16, UInt32, UIn
 _GOLDEN_GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
-
+# A point that moves tries so many last bits for a hash that is as small as it was. Then a sample is
+# worth at least so many times its size, against the points of later frames.
+TRIES = 64
 
 NO_POINTS: Float32 = np.zeros((0, 3), np.float32)
 NO_KEYFRAMES: UInt16 = np.zeros(0, np.uint16)
@@ -64,11 +66,28 @@ def add_flat(
     points: Float32,
     new_keyframes: UInt16,
     starts: Int64,
+    greatest: UInt64 | None = None,
 ) -> Bool:
-    """As `add_points`; set k is points[starts[k] : starts[k + 1]]."""
+    """As `add_points`; set k is points[starts[k] : starts[k + 1]].
+
+    Points that have moved, and whose hashes were at most `greatest` (n,), see `greatest_hashes`,
+    are changed in their last bits until it is so again: as any new points they would be rare in a
+    sample of many frames, and the next frame would push them out.
+    """
     points_world, keyframes, counts = samples
     bits = points_world.view(np.uint32), keyframes
-    return _add(*bits, counts, rows, points.view(np.uint32), new_keyframes, starts)
+    if greatest is None:
+        greatest = np.full(len(rows), np.iinfo(np.uint64).max)
+    new_bits = np.require(points, requirements="W").view(np.uint32)
+    return _add(*bits, counts, rows, new_bits, new_keyframes, starts, greatest)
+
+
+def greatest_hashes(points_world: Float32, counts: Int64, rows: Int64) -> UInt64:
+    """The greatest hash (n,) of each of n samples; see `add_points`. That of an empty one is 0."""
+    found = np.zeros(len(rows), np.uint64)
+    for index in np.flatnonzero(counts[rows]).tolist():
+        found[index] = _hash(points_world[rows[index], counts[rows[index]] - 1].view(np.uint32))
+    return found
 
 
 @kernel
@@ -94,6 +113,7 @@ def _add(
     new_bits: UInt32,
     new_keyframes: UInt16,
     starts: Int64,
+    most: UInt64,
 ) -> Bool:
     capacity = bits.shape[1]
     changed = np.zeros(len(rows), np.bool_)
@@ -105,7 +125,24 @@ def _add(
         greatest = _hash(bits[row, known - 1]) if known == capacity else np.uint64(0)
         count = 0
         for point in range(starts[index], starts[index + 1]):
-            entering[count], hashes[count] = point, _hash(new_bits[point])
+            least = _hash(new_bits[point])
+            if (
+                least > most[index]
+            ):  # its last bits are changed, within its millimetre: its cells stay
+                best, tried = new_bits[point], new_bits[point].copy()
+                tried[:] += np.uint32(TRIES)
+                here, there = best.view(np.float32), tried.view(np.float32)
+                steps = np.where(np.floor(here * 1e3) == np.floor(there * 1e3), 1, -1)
+                tried[:] = best
+                for turn in range(TRIES):
+                    tried[turn % 3] += np.uint32(steps[turn % 3] & 0xFFFFFFFF)
+                    found = _hash(tried)
+                    if found < least:
+                        least = found
+                        best[:] = tried
+                    if least <= most[index]:
+                        break
+            entering[count], hashes[count] = point, least
             count += int(known < capacity or hashes[count] < greatest)
         # Most frames add nothing to a full sample.
         if count == 0:

@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.merging import VOCABULARY, local_graph, random_local_graphs, random_pose, seeds
+from typer.testing import CliRunner
 
+from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig
 from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.graph.provenance import (
@@ -19,6 +21,7 @@ from deworldsg_ros.graph.provenance import (
 )
 from deworldsg_ros.graph_builder import MOVED_A_CALL, GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
+from deworldsg_ros.poses.trajectory import write_tum
 from deworldsg_ros.scene.camera import (
     interpolate_pose,
     interpolate_poses,
@@ -133,11 +136,12 @@ def test_what_was_seen_follows_a_trajectory_of_the_camera_or_of_its_body(every, 
     # The correction of drift had moved the frames, too.
     places = places_after(change, stamps, T_drift @ wrong)
     expected = (true @ np.array([0, 0, 2.0, 1.0]))[:, :3]
-    # Frames of a keyframe share its pose: within it, the drift goes on.
-    assert np.linalg.norm(places - expected, axis=1).max() < 0.03
+    # Frames of a keyframe share its pose, which is right for their mean: within it, drift goes on.
+    errors = places - expected
+    assert np.linalg.norm(errors, axis=1).max() < (0.03 if every > 1 else 0.01)
     starts = change.starts_ns
-    at = np.isin(stamps, starts)
-    np.testing.assert_allclose(places[at], expected[at], atol=0.02 if every > 1 else 1e-6)
+    for part in np.split(errors, stamps.searchsorted(starts[1:])):
+        assert np.linalg.norm(part.mean(axis=0)) < (0.03 if every > 1 else 0.001)
     assert trail.follow(stamps[::every], bodies[1][::every]) is None
     # And back again: now no drift is taken back.
     back = trail.follow(stamps[::every], bodies[0][::every])
@@ -334,6 +338,20 @@ def test_a_node_that_was_seen_before_and_after_moves_piece_by_piece() -> None:
     np.testing.assert_allclose(nodes.covariances[slot], np.cov(points.T), atol=2e-3)
 
 
+def test_what_was_seen_before_a_correction_outlasts_the_frames_after_it() -> None:
+    builder = builder_of("surface")
+    for second in range(1, 21):
+        builder.integrate(slab_at(second * S, 0.0, seed=second))
+    builder.apply_correction(shift(2.0), S)
+    for second in range(21, 24):  # then its right half is in view
+        slab = slab_at(second * S, 2.0, seed=second)
+        half = slab.surface_points_world[0][slab.surface_points_world[0][:, 0] > 2.0]
+        assert builder.integrate(derived(slab, surface_points_world=(half,))) == [1]
+    points = surface_points(states(builder)[1])
+    # 20 frames of a half of the slab against 23 of the other.
+    assert 0.4 < np.mean(points[:, 0] < 2.0) < 0.5
+
+
 @BOTH
 def test_doubles_that_meet_are_merged_and_the_older_id_lives_on(association: str) -> None:
     builder, copy = builder_of(association), GraphReplica()
@@ -380,6 +398,35 @@ def test_a_map_goes_on_with_its_keyframes(tmp_path) -> None:
     assert again.apply_correction(shift(0.5), 3 * S) == 2
     means = [node.mean_m[0] for node in states(again).values()]
     np.testing.assert_allclose(means, [0.0, 3.5, 6.5], atol=0.01)
+
+
+def test_a_map_follows_a_trajectory_file(tmp_path) -> None:
+    builder = builder_of("surface")
+    for second in range(1, 7):  # since the fourth second, the poses are off
+        T = shift(0.5 if second > 3 else 0.0)
+        builder.integrate(slab_at(second * S, 3.0 * (second > 3), T, seed=second))
+    path, file = tmp_path / "room.map", tmp_path / "slam.txt"
+    write_map(builder, path)
+    before = path.read_bytes()
+
+    def edit(*words: str) -> str:
+        done = CliRunner().invoke(app, ["edit", *words])
+        return f"{done.exit_code} {done.output}".replace("\n", " ")
+
+    later = [S * 100, S * 101]
+    write_tum(file, later, [np.eye(4)] * 2)
+    said = edit(str(path), "follow", str(file))
+    assert "from 100.000 to 101.000 s" in said and "frames from 1.000 to 6.000 s" in said
+    assert said[0] != "0" and "seconds and metres" in edit(str(path), "follow", str(path))
+    assert "after the map file" in edit("--live", "follow", str(file))
+    assert path.read_bytes() == before
+    write_tum(file, [second * S for second in range(1, 7)], [np.eye(4)] * 6)
+    assert edit(str(path), "follow", str(file)) == "0 1 object moved, by up to 0.50 m "
+    again = read_map(config_of("surface"), path)
+    means = [node.mean_m[0] for node in states(again).values()]
+    np.testing.assert_allclose(means, [0.0, 3.0], atol=0.02)
+    assert again.integrate(slab_at(7 * S, 3.0)) == [2]
+    assert edit(str(path), "follow", str(file)) == "0 0 objects moved, by up to 0.00 m "
 
 
 def test_a_drift_of_a_metre_and_five_degrees_over_a_loop_is_gone_when_it_closes() -> None:

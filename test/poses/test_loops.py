@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.corner_room import camera_at, corner_frame
 from support.spaces import looking
 
+from bench.odometry import false_loops, mirrored
 from deworldsg_ros.config import Config
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.pipeline import Pipeline
@@ -313,6 +314,30 @@ def test_a_trajectory_that_sees_no_place_again_is_open():
     assert np.linalg.norm((frames[-1].T_world_camera - TRUE[29])[:3, 3]) < 0.02
     assert "open" in closings_in_words(odometry.closed, odometry.correction_m)
     assert closings_in_words(3, 0.012) == "loop closed 3 times, last correction 1.2 cm"
+
+
+OTHER = [
+    ((-2.2, -2.6, 0.0), (3.0, 1.9, 2.5)),
+    ((1.2, 0.6, 0.0), (2.6, 1.8, 0.75)),
+    ((-2.2, -1.6, 0.0), (-1.7, -0.2, 1.9)),
+    ((0.4, -2.5, 0.0), (1.3, -1.8, 0.8)),
+]
+
+
+@pytest.mark.parametrize(("scene", "closes"), [(SCENE, True), (OTHER, False)])
+def test_a_camera_that_is_carried_to_another_room_closes_no_loop_with_the_first(scene, closes):
+    odometry = drifting(0.0, 0.0)
+    list(tracked(odometry, 50))
+    # It is put down where it thinks that it has been: only what it sees is another room.
+    frames = [RgbdFrame(0, np.full((120, 160, 3), 128, np.uint8), look(scene, T)[0], CAMERA,
+                        np.eye(4), "odom", None) for T in TRUE[:30]]  # fmt: skip
+    odometry.odometry = Drifting(0.0, 0.0)
+    odometry.odometry.restarts = 1
+    tries, found = false_loops(odometry, frames)
+    assert tries >= 7 and (found > 0) == closes
+    mirrors = list(mirrored(frames))
+    np.testing.assert_array_equal(mirrors[3].depth_m[:, ::-1], frames[3].depth_m)
+    assert mirrors[3].intrinsics == CAMERA  # it looks along the middle
 
 
 def test_keyframes_are_bounded_and_loops_survive(monkeypatch):

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import seeds
 
-from deworldsg_ros.scene.surface import _hash, add_points, drop_points
+from deworldsg_ros.scene.surface import _hash, add_flat, add_points, drop_points, greatest_hashes
 
 
 class Samples:
@@ -93,3 +93,44 @@ def test_dropped_points_leave_a_sample_that_goes_on() -> None:
     for count, left in ((len(whole[0]), len(whole[0])), (len(whole[0]) - 1, 1)):
         drop_points(*samples.arrays(), np.array([1]), np.arange(40)[None] < count)
         assert len(samples.points(1)) == left
+
+
+def test_moved_points_are_not_pushed_out_by_the_next_ones() -> None:
+    rng = np.random.default_rng(1)
+    # 20 views of a whole surface; then it moves, and 2 views show its right half.
+    views = rng.random((20, 100, 3)).astype(np.float32)
+    later = (rng.random((200, 3)) * [0.5, 1, 1] + [5.5, 0, 0]).astype(np.float32)
+    left = {}
+    for keeps in (True, False):
+        samples = Samples(1, 100)
+        for view in views:
+            samples.add([0], [view])
+        row, old = np.zeros(1, np.int64), samples.points(0).copy()
+        greatest = greatest_hashes(samples.points_world, samples.counts, row)
+        new = old + np.float32([5, 0, 0])
+        samples.counts[0] = 0
+        starts, keyframes = np.array([0, len(new)]), np.zeros(len(new), np.uint16)
+        add_flat(samples.arrays(), row, new.copy(), keyframes, starts, greatest if keeps else None)
+        moved = samples.points(0)
+        order = [np.lexsort(np.round(points, 4).T) for points in (new, moved)]
+        np.testing.assert_allclose(moved[order[1]], new[order[0]], atol=1e-4)
+        add_points(*samples.arrays(), row, [later], np.zeros(len(later), np.uint16))
+        left[keeps] = np.count_nonzero(samples.points(0)[:, 0] < 5.5)
+    # As if it had been there always: about 2000 / 2200 of the sample are of the old views.
+    assert left[True] > 35 and left[False] < 25
+
+
+def test_the_hashes_of_moved_points_are_as_small_as_they_were() -> None:
+    points = np.random.default_rng(2).random((800, 3))
+    samples = sample_of(points, 100)
+    row = np.zeros(1, np.int64)
+    greatest = greatest_hashes(samples.points_world, samples.counts, row)
+    assert greatest[0] == max(samples.of(0)[0])
+    new, starts = samples.points(0) * np.float32(-2.0), np.array([0, 100])
+    samples.counts[0] = 0
+    add_flat(samples.arrays(), row, new, np.zeros(100, np.uint16), starts, greatest)
+    hashes = [int(_hash(bits)) for bits in samples.points(0).view(np.uint32)]
+    # One in eight is so small: 64 tries find such a one, nearly always.
+    assert sum(one <= greatest[0] for one in hashes) >= 97
+    # Uniform below it, so that the next points find their places among them.
+    assert abs(np.median(np.array(hashes, float)) / float(greatest[0]) - 0.5) < 0.15
