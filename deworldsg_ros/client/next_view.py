@@ -56,9 +56,7 @@ SECTORS = 12
 # A view of a known object from farther away tells little.
 NODE_RANGE_M = 4.0
 # Standing still and turning cost as much as so much of the way: radian, and each view.
-TURN_M, VIEW_M = 0.05, 0.3
-# Part of what the other directions from there would tell that counts, too.
-AROUND = 0.5
+TURN_M, VIEW_M = 0.05, 0.1
 # For people, in place of a pose.
 NOTHING = "nothing is worth a look: no space, name, object or relation would be told better"
 # A robot may stand so far beside the known cells.
@@ -265,8 +263,12 @@ def novelty(sides: Float64, clear: Float64, side: Int64) -> Float64:
     rows = np.arange(len(sides))
     beside = np.maximum(sides[rows, (side + 1) % SECTORS], sides[rows, side - 1])
     had = np.maximum(sides[rows, side], 0.5 * beside)
-    many = 1.0 + 0.5 * (sides > 0.3).sum(axis=1)
-    return np.asarray(np.maximum(clear - had, 0.0) / many)
+    return np.asarray(np.maximum(clear - had, 0.0) / of_many(sides))
+
+
+def of_many(sides: Float64) -> Float64:
+    """By how much less (n,) one more view of objects tells, for the sides that were seen."""
+    return np.asarray(1.0 + 0.5 * (sides > 0.3).sum(axis=1))
 
 
 @dataclass
@@ -344,16 +346,17 @@ def next_view(
     )
     views = views_from(places_of(reached), reached, looks, items)
     gains = np.sum(list(views.nats.values()), axis=0)
-    cost = np.full(gains.shape, VIEW_M)
-    if here is not None:
-        cost += views.way_m[:, None] + TURN_M * _turns(cells, has_views)
-    # To turn there afterwards costs little.
-    around = gains.mean(axis=1, keepdims=True) * 2.0 * np.pi / camera.width_rad
-    worth = np.where(gains < LEAST_NATS, 0.0, (1.0 - AROUND) * gains + AROUND * around)
-    place, yaw = np.unravel_index(int((worth / cost).argmax()), gains.shape)
-    if not worth[place, yaw]:
+    # A place tells what a whole turn there tells: to turn costs little.
+    told = gains.mean(axis=1) * 2.0 * np.pi / camera.width_rad
+    told[gains.max(axis=1) < LEAST_NATS] = 0.0
+    if not told.any():
         return None
-    return _answer(graph, cells, views, looks, items, (int(place), int(yaw)), here)
+    way_m, turns = (
+        (0.0, np.zeros(YAWS)) if here is None else (views.way_m, _turns(cells, has_views))
+    )
+    place = int((told / (VIEW_M + way_m)).argmax())
+    yaw = int((gains[place] / (VIEW_M + TURN_M * turns)).argmax())
+    return _answer(graph, cells, views, looks, items, (place, yaw), here)
 
 
 def _turns(cells: SeenCells, has_views: bool) -> Float64:
@@ -401,10 +404,12 @@ def views_from(chosen: Int64, reached: Reach, looks: Looks, items: Items) -> Vie
     directions = -ways[at, rows]
     clear = clarity(np.linalg.norm(directions, axis=1))
     new = RESOLVED * novelty(items.sides[rows], clear, sector(directions))
+    # Whether it is there, a view from a side that was seen tells, too: a detector misses at times.
+    again = RESOLVED * clear / of_many(items.sides[rows])
     in_view = looks.by_yaw(np.arctan2(-directions[:, 1], -directions[:, 0]))
     parts = {
         "names": (at, in_view, new * items.names[rows], rows),
-        "existence": (at, in_view, new * items.exists[rows], rows),
+        "existence": (at, in_view, again * items.exists[rows], rows),
         "relations": _relations(at, rows, new, in_view, items),
     }
     for kind, (of, inside, values, _) in parts.items():

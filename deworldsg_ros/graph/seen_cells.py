@@ -27,6 +27,8 @@ BELOW_M, ABOVE_M, STOREY_M = 2.6, 1.0, 1.2
 MOST_CELLS = 20_000_000  # a place of 100 m by 100 m, 60 MB
 # A view tells all of what is so near; of what is farther, less, by the square of the distance.
 CLEAR_M = 2.5
+# But at most this part: a detector finds in one view what it missed in another.
+ONE_VIEW = 0.6
 UNSEEN, FREE, OCCUPIED = 0, 1, 2
 # Cells are horizontal if up is turned by less than a degree.
 MOST_TILT = math.cos(math.radians(1.0))
@@ -51,7 +53,8 @@ class SeenCells:
     Attributes:
         first: (3,) number of the first cell along each axis.
         free, hits: (x, y, z) uint8: how many views saw through a cell, and how many saw something.
-        clear: (x, y, z) uint8: the best `clarity` of its points, times 255.
+        clear: (x, y, z) uint8: how much of it the views have told, times 255: each one `ONE_VIEW`
+            times its `clarity` of what was left.
         poses, cameras: (k, 4, 4) and (k, 4) of the views, as in `SeenSpace`.
         shape: (h, w) of the images.
     """
@@ -116,10 +119,10 @@ class SeenCells:
         x, y, z = np.floor(points / np.float32(CELL_M)).astype(np.int32) - self.first[:, None]
         inside = (z >= 0) & (z < self.hits.shape[2])
         flat = ((x * self.hits.shape[1] + y) * self.hits.shape[2] + z)[inside]
-        clear = MOST * clarity(depth[shows] * np.sqrt((rays * rays).sum(axis=0)))
-        np.maximum.at(self.clear.reshape(-1), flat, clear[inside].astype(np.uint8))
+        told = ONE_VIEW * clarity(depth[shows] * np.sqrt((rays * rays).sum(axis=0)))[inside]
         # A view counts once in a cell: of equal rows, one is written.
-        hits = self.hits.reshape(-1)
+        hits, clear = self.hits.reshape(-1), self.clear.reshape(-1)
+        clear[flat] += ((MOST - clear[flat]) * told).astype(np.uint8)
         hits[flat] = np.minimum(hits[flat], MOST - 1) + 1
         self._carve(depth, camera, turn, start, (low, high))
 
@@ -341,7 +344,7 @@ AZIMUTHS, ELEVATIONS, YAWS = 48, 7, 24
 # Things stand below this height above the floor.
 WORTH_M = 1.8
 # In space that was never seen, a ray ends after about so much.
-FREE_PATH_M = 2.0
+FREE_PATH_M = 4.0
 # Views are alike that are so near and turned by so little, as of `SeenSpace`; up to twice as far,
 # they are in part.
 LIKE_M, LIKE_RAD = 1.2 * MOVED_M, 1.2 * TURNED_RAD

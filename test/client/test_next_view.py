@@ -137,6 +137,38 @@ def test_a_view_that_was_had_already_tells_less():
     assert gains[1]["names"] <= gains[0]["names"]
 
 
+def test_from_the_same_side_a_view_tells_whether_it_is_there_not_what_it_is():
+    hidden = wire.HiddenNode("vase", [0.8, 0.0, 0.85], 0.4, 1, "seen once")
+    cup = thing(1, "cup", (0.8, 0.1, 0.85), (0.1, 0.1, 0.1), sure=0.5)
+    graph = seen_graph(cup, space=half_seen(None), hidden=[hidden])
+    cells = SeenCells(UP).add(graph.space)
+    state = cells.state
+    reached = reach(cells, state, 0.2, 1.0, np.array([-1.5, 0.0]))
+    looks = Looks(cells, state, ViewCamera.of(cells), cells.floor_m)
+    items = items_of(graph, cells.axes)
+    items.sides = sides_seen(items, cells, looks)
+    nats = []
+    for place in ((-0.7, 0.0), (0.8, -1.2)):  # the side of the views so far, and another one
+        cell = np.floor(np.array(place) / CELL_M).astype(int) - reached.first
+        views = views_from(cell[None], reached, looks, items)
+        nats.append({kind: values.max() for kind, values in views.nats.items()})
+    assert nats[0]["names"] < 0.01 < 0.05 < nats[1]["names"]
+    assert nats[0]["existence"] > 0.1 and nats[1]["existence"] > 0.1
+
+
+def test_one_view_does_not_tell_all_of_a_surface():
+    space, told = SeenSpace(), []
+    cells = SeenCells(UP)
+    for number in range(4):
+        add_view(space, looking((-0.3 * number, 0.0, 1.2), 0.0), 10**9 * (number + 1), None)
+        before = cells.clear.sum(dtype=np.int64)
+        cells.add(space)
+        told.append(int(cells.clear.sum(dtype=np.int64) - before))
+        assert cells.clear.max() <= math.ceil(255 * (1.0 - 0.4 ** (number + 1)))
+    # Each view tells something, and less than the first one.
+    assert min(told) > 0 and max(told[1:]) < told[0]
+
+
 @pytest.mark.parametrize("side_m", [0.2, 0.3, 0.5])
 def test_only_places_are_tried_to_which_the_robot_can_get(side_m):
     """Also those behind a wall with a gap: it gets there only if it fits through."""
