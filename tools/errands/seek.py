@@ -25,7 +25,7 @@ SURE = 0.35
 # Before the robot says that a thing is not there, it looks at what may be it.
 DOUBTFUL = 0.05
 # What never was in the graph is not sought farther than that.
-MOST_SEEK_M = 12.0
+MOST_SEEK_M = 16.0
 # Where a thing may have been put.
 SURFACES = ("dining table", "desk", "counter", "cabinet", "stand", "couch", "bed")
 
