@@ -15,11 +15,11 @@ from deworldsg_ros.client.objects import SceneObject
 # Places that the robot goes to in one errand, at most.
 MOST_PLACES = 16
 # Something so near is looked at from where the robot is, if it is seen from there.
-NEAR_ENOUGH_M = 1.35
+NEAR_ENOUGH_M = 1.4
 # A node is the same one if it is as near to where it was.
 SAME_M = 0.4
 # A surface is looked at if it was seen from so near, and in this many checks.
-LOOKED_M, CHECK_FRAMES = 3.5, 4
+LOOKED_M, CHECK_FRAMES = 2.5, 4
 # From near, a thing is what it was asked for if the answer is as probable.
 SURE = 0.35
 # Before the robot says that a thing is not there, it looks at what may be it.
@@ -102,8 +102,8 @@ class Seeker:
 
         From where it is not in view, the robot tries one other side.
         """
-        gap_m = float(np.linalg.norm(np.array(target.position_m[:2]) - self.at[:2]))
-        if gap_m < NEAR_ENOUGH_M:
+        away_m = float(np.linalg.norm(np.array(target.position_m[:2]) - self.at[:2]))
+        if away_m - max(target.size_m[:2]) / 2 < NEAR_ENOUGH_M:
             way = np.array(target.position_m[:2]) - self.at[:2]
             turn = math.atan2(way[1], way[0]) - self.at[2]
             seen = self._seen(target, self._look_at(turn + float(self.robot.believed[2])))
