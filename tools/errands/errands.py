@@ -35,8 +35,8 @@ from deworldsg_ros.client.objects import SceneObject
 from deworldsg_ros.scene.camera import invert_pose
 
 ROOT = Path(__file__).resolve().parents[2]
-# The homes of the reported figures; the constants were chosen on homes 0 to 9.
-FIRST, HOMES = 100, 10
+# The homes of the reported figures; the constants were chosen on homes below 200.
+FIRST, HOMES = 200, 10
 # An errand is fulfilled if the thing is in view from here, with so many pixels.
 IN_VIEW_M, IN_VIEW_PX = 1.5, 100
 # A node is an object if it is as near to its box, and no object of the same name is nearer.
@@ -61,6 +61,7 @@ class Outcome:
         failure: the stage that failed; empty = fulfilled.
         path_m, shortest_m: of the robot, and the shortest one; 0 where it stayed.
         said: what the robot made of it.
+        steps: what it went to, and what came of that.
     """
 
     method: str
@@ -71,6 +72,7 @@ class Outcome:
     path_m: float = 0.0
     shortest_m: float = 0.0
     said: str = ""
+    steps: tuple[str, ...] = ()
 
 
 class Referee:
@@ -242,7 +244,10 @@ class Errands:
         failure = self._judge(task, target, chosen, reached)
         if not failure and chosen is not None and _is_long(path_m, shortest_m):
             failure = "path too long"
-        return Outcome(US, task.kind, task.words, self.seed, failure, path_m, shortest_m, said)
+        return Outcome(
+            US, task.kind, task.words, self.seed, failure, path_m, shortest_m, said,
+            tuple(self.seeker.told),
+        )  # fmt: skip
 
     def _judge(
         self, task: Task, target: SceneObject | None, chosen: int | None, reached: bool
@@ -350,6 +355,8 @@ def _tell(outcomes: list[Outcome]) -> None:
             f"{one.path_m:5.1f} m, shortest {one.shortest_m:4.1f} m; {one.said}",
             flush=True,
         )
+        if one.failure:
+            print("".join(f"          {step}\n" for step in one.steps), end="", flush=True)
 
 
 def run_all(
