@@ -43,7 +43,9 @@ FRAME_FAULTS = FrameFaults(flip=0.1, miss=0.1, jitter_px=2.0)
 FAULTS = Faults(label=0.05, false=0.5)
 # An answer that is less probable is none; those that are about as probable as the best are equal.
 LEAST, EQUAL = 0.15, 0.8
-DISTANCES_M = (1.2, 0.9, 0.7)
+# From the box of a thing. Where it is near already, the robot goes no nearer than it has to; across
+# a bed, there is no nearer place.
+DISTANCES_M, FAR_M = (1.2, 0.9, 0.7), 1.4
 # Another side is tried if the path is so many times longer than the straight line.
 DIRECT = 1.5
 # Places that are nearer than this see the same.
@@ -282,7 +284,9 @@ def way_to(
     sides = own[:2] + 4.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     least_m = (CAMERA_M - target.height_m) / math.tan(SEES_DOWN_RAD)
     best: tuple[float, Way] | None = None
-    for distance_m in [d for d in DISTANCES_M if d >= least_m] or DISTANCES_M[:1]:
+    away_m = float(np.linalg.norm(own[:2] - at_graph[:2]))
+    distances_m = (FAR_M, *DISTANCES_M) if away_m < 2 * FAR_M else (*DISTANCES_M, FAR_M)
+    for distance_m in [d for d in distances_m if d >= least_m] or [FAR_M]:
         for x, y in [at_graph[:2].tolist(), *sides.tolist()]:
             try:
                 goal = graph.goal_near(target, distance_m, robot=footprint, towards=(x, y, 0.0))
