@@ -113,6 +113,7 @@ def test_a_wall_hides_what_is_behind_it_and_a_table_does_not(tool):
         for _ in range(3):
             grid.see(depth_m, T)
         assert grid.hides(np.array([1.2, 1.0]), np.array([2.8, 1.0])) is is_hidden
+    assert grid.hides(np.array([-50.0, 1.0]), np.array([2.8, 1.0]))
     low = robot.Grid.around(home)
     v = (np.arange(480) - 239.5)[:, None] / 525
     down = np.sin(robot.TILT_RAD) + v * np.cos(robot.TILT_RAD)

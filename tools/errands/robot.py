@@ -159,7 +159,10 @@ class Grid:
         self.hits += 20 * self._cells_of(np.array([[*edge, 0.0]]))
 
     def hides(self, place: np.ndarray, target: np.ndarray) -> bool:
-        """Whether a wall, or what is as high, is between a place (2,) and a target (2,)."""
+        """Whether a wall, or what is as high, is between a place (2,) and a target (2,).
+
+        A line that leaves the grid is behind the walls.
+        """
         way = target - place
         far_m = float(np.linalg.norm(way)) - NEAR_TARGET_M
         if far_m <= 0.0:
@@ -167,7 +170,9 @@ class Grid:
         steps = np.arange(0.0, far_m, CELL_M / 2)[:, None]
         line = place + steps * way / np.linalg.norm(way)
         columns, rows = np.floor((line - self.corner) / CELL_M).astype(int).T
-        return bool((self.tall[rows, columns] >= 3).any())
+        inside = (np.minimum(rows, columns) >= 0) & (rows < len(self.tall))
+        inside &= columns < self.tall.shape[1]
+        return not inside.all() or bool((self.tall[rows, columns] >= 3).any())
 
     def clearance(self) -> np.ndarray:
         """Distance (rows, columns) of each free cell from what is occupied or unknown, metres."""
