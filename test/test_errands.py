@@ -5,8 +5,11 @@ import sys
 
 import numpy as np
 import pytest
+from support.view import box_at, make_graph, make_node
 
+from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.wire import messages as wire
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +102,45 @@ def test_the_planner_finds_the_shortest_way_round_a_wall(tool):
     rows, columns = np.floor(path[:, ::-1] / 0.05).astype(int).T
     assert (clearance[rows, columns] > 0.2).all()
     assert planner.path(np.array([1.0, 0.5]), np.array([2.1, 0.5])) is None
+
+
+def test_a_wall_hides_what_is_behind_it_and_a_table_does_not(tool):
+    robot, home = tool("robot"), tool("home").build(3)
+    grid = robot.Grid.around(home)
+    T = robot.looking(1.0, 1.0, 0.0)
+    for ahead_m, is_hidden in ((2.0, False), (1.0, True)):  # a wall behind the target, before it
+        depth_m = np.full((480, 640), ahead_m, np.float32)
+        for _ in range(3):
+            grid.see(depth_m, T)
+        assert grid.hides(np.array([1.2, 1.0]), np.array([2.8, 1.0])) is is_hidden
+    assert grid.hides(np.array([-50.0, 1.0]), np.array([2.8, 1.0]))
+    low = robot.Grid.around(home)
+    v = (np.arange(480) - 239.5)[:, None] / 525
+    down = np.sin(robot.TILT_RAD) + v * np.cos(robot.TILT_RAD)
+    # A table of 0.7 m: what looks more than that down sees its top, the rest sees nothing.
+    with np.errstate(divide="ignore"):
+        depth_m = np.where(down > 0.1, 0.5 / down, 0.0).repeat(640, axis=1).astype(np.float32)
+    for _ in range(3):
+        low.see(depth_m, T)
+    assert low.hits.any() and not low.hides(np.array([1.2, 1.0]), np.array([2.8, 1.0]))
+
+
+def test_answers_are_the_nearest_of_those_that_are_about_as_probable(tool):
+    mind = tool("mind")
+    places = {1: (4.0, 0.9), 2: (1.0, 0.85), 3: (0.5, 0.3), 4: (0.2, 0.1)}
+    nodes = [
+        make_node(
+            node_id, "cup", (x, 0.0, 0.8), existence=1.0,
+            classes=[wire.Belief("cup", share), wire.Belief("bowl", 1.0 - share)],
+            box=box_at((x, 0.0, 0.8), (0.08, 0.08, 0.1 if node_id < 4 else 0.4)),
+        )
+        for node_id, (x, share) in places.items()
+    ]  # fmt: skip
+    graph = SceneGraph(make_graph(nodes))
+    found = mind.answers_to(graph, "cup", np.zeros(3), 0.15)
+    assert [one.item.id for one in found] == [2, 1, 3]
+    assert mind.answers_to(graph, "teapot", np.zeros(3), 0.15) == []
+    assert mind.like(graph[1], graph[2]) and not mind.like(graph[1], graph[4])
 
 
 @pytest.mark.slow

@@ -100,7 +100,10 @@ def polygon_gap_m(a: Float64, b: Float64) -> float:
 
 
 def point_gaps_m(point: Float64, polygons: Float64) -> Float64:
-    """Distances (k,) of a point (2,) from convex polygons (k, n, 2), corners anticlockwise."""
+    """Distances (k,) of a point (2,) from convex polygons (k, n, 2), corners anticlockwise.
+
+    Of a point for each polygon, (k, 1, 2), the distances from its own.
+    """
     sides = np.roll(polygons, -1, axis=1) - polygons
     offsets = point - polygons
     # For each side, twice the area of the triangle with the point. Nothing is inside of a line.

@@ -207,30 +207,31 @@ def goal_near(
     low = [item for item in obstacles if item.footprint.low < floor + robot.height_m]
     area = _hull(np.concatenate([item.footprint.corners for item in [target, *obstacles]]))
     boxes = np.array([item.footprint.corners for item in low]).reshape(-1, 4, 2)
-    best: tuple[float, Goal] | None = None
     rays = _rays()
-    spots = np.array([_spot(target.footprint, ray, distance) for ray in rays])
-    shares = _seen_free(space, target, spots, floor, robot)
-    walls = _walls_between(space, target, spots, floor + SIGHT_HEIGHT * robot.height_m)
-    for ray, spot, seen_free, is_behind in zip(rays, spots, shares, walls):
-        clearance = float(point_gaps_m(spot, boxes).min(initial=math.inf)) - robot.radius_m
-        if clearance <= 0.0:
-            continue
+    spots = _spots(target.footprint, rays, distance)
+    clearances = [float(point_gaps_m(s, boxes).min(initial=math.inf)) for s in spots]
+    free = np.flatnonzero(np.array(clearances) > robot.radius_m)
+    in_sight = _in_sight(target, obstacles)
+    goals: list[Goal] = []
+    for row, seen_free in zip(free, _seen_free(space, target, spots[free], floor, robot)):
         if seen_free is not None and seen_free < 0.0:
             continue
-        blocker = _blocker(target, obstacles, spot)
+        ray, spot, clearance = rays[row], spots[row], clearances[row] - robot.radius_m
+        blocker = _blocker(target, in_sight, spot)
         known = area is not None and bool(point_gaps_m(spot, area[None])[0] == 0.0)
         goal = _goal(target, ray, spot, floor, stamp_ns, clearance, blocker, known)
-        goal = replace(goal, seen_free=seen_free)
-        score = _score(goal, towards) - 5.0 * is_behind
-        if best is None or score > best[0] + 1e-9:
-            best = (score, goal)
-    if best is None:
+        goals.append(replace(goal, seen_free=seen_free))
+    if not goals:
         raise ClientError(
             f"no free side of {target.name} at {distance:g} m: other objects are within "
             f"{robot.radius_m:g} m of every pose; try another distance, or a smaller radius"
         )
-    return best[1]
+    goals.sort(key=lambda goal: -_score(goal, towards))
+    # A look along 72 lines costs far more than along the few that lead to the best one.
+    level_m = floor + SIGHT_HEIGHT * robot.height_m
+    axes = horizontal_axes(target.up)
+    seen = (g for g in goals if not _is_behind_wall(space, target, axes @ g.position_m, level_m))
+    return next(seen, goals[0])
 
 
 def _score(goal: Goal, towards: Point | None) -> float:
@@ -295,19 +296,17 @@ def _seen_free(
     return np.where(occupied > MAX_OCCUPIED, -1.0, free).tolist()
 
 
-def _walls_between(
-    space: SeenSpace | None, target: SceneObject, spots: Float64, level_m: float
-) -> list[bool]:
-    """Whether something was seen between each spot and the target, above what is low there."""
+def _is_behind_wall(
+    space: SeenSpace | None, target: SceneObject, spot: Float64, level_m: float
+) -> bool:
+    """Whether something was seen between a spot and the target, above what is low there."""
     if space is None or not len(space):
-        return [False] * len(spots)
+        return False
     level, own = max(level_m, target.footprint.high + SIGHT_ABOVE_M), target.footprint.center
-    count = int(np.linalg.norm(spots - own, axis=1).max() / SIGHT_STEP_M) + 2
-    shares = np.linspace(0.0, 1.0, count)[:, None]
-    lines = (spots[:, None] + shares * (own - spots[:, None])).reshape(-1, 2)
-    points = np.column_stack([lines, np.full(len(lines), level)]) @ horizontal_axes(target.up)
-    occupied = space.look(points)[1].reshape(len(spots), -1)
-    return [bool(count > 1) for count in occupied.sum(axis=1)]
+    count = int(np.linalg.norm(spot[:2] - own) / SIGHT_STEP_M) + 2
+    line = spot[:2] + np.linspace(0.0, 1.0, count)[:, None] * (own - spot[:2])
+    points = np.column_stack([line, np.full(count, level)]) @ horizontal_axes(target.up)
+    return bool(space.look(points)[1].sum() > 1)
 
 
 def floor_m(items: Sequence[SceneObject]) -> float:
@@ -360,16 +359,16 @@ def _plan(point: Point, up: Point) -> Float64:
     return np.asarray(horizontal_axes(up)[:2] @ np.array(point))
 
 
-def _spot(box: Footprint, ray: Float64, distance: float) -> Float64:
-    """The point (2,) in a direction from the centre of a box at a distance from the box."""
-    low, high = 0.0, distance + float(np.ptp(box.corners, axis=0).sum())
+def _spots(box: Footprint, rays: Float64, distance: float) -> Float64:
+    """The points (n, 2) at a distance from a box, in directions (n, 2) from its centre."""
+    low, high = np.zeros((2, len(rays), 1))
+    high += distance + float(np.ptp(box.corners, axis=0).sum())
+    boxes, center = np.repeat(box.corners[None], len(rays), axis=0), box.center
     for _ in range(20):  # the gap grows along the ray; 20 halvings give micrometres
         middle = (low + high) / 2
-        if point_gaps_m(box.center + middle * ray, box.corners[None])[0] < distance:
-            low = middle
-        else:
-            high = middle
-    return np.asarray(box.center + high * ray)
+        is_near = point_gaps_m((center + middle * rays)[:, None], boxes)[:, None] < distance
+        low, high = np.where(is_near, middle, low), np.where(is_near, high, middle)
+    return np.asarray(center + high * rays)
 
 
 def _hull(points: Float64) -> Float64 | None:
@@ -382,19 +381,29 @@ def _hull(points: Float64) -> Float64 | None:
         return None
 
 
-def _blocker(
-    target: SceneObject, obstacles: Iterable[SceneObject], spot: Float64
-) -> SceneObject | None:
-    """An object between a spot and the target that is higher than the target's centre."""
+def _in_sight(
+    target: SceneObject, obstacles: Sequence[SceneObject]
+) -> list[tuple[SceneObject, Float64]]:
+    """What is as high as the target's centre and not around it, with the corners of its box."""
     own = target.footprint
     height = (own.low + own.high) / 2
-    line = np.array([spot, own.center])
-    for item in obstacles:
-        box = item.footprint
-        if box.high <= height or box.low >= height:
-            continue
-        around = point_gaps_m(own.center, box.corners[None])[0] == 0.0
-        if not around and polygon_gap_m(line, box.corners) == 0.0:
+    level = [(item, item.footprint) for item in obstacles]
+    return [
+        (item, box.corners)
+        for item, box in level
+        if box.low < height < box.high and point_gaps_m(own.center, box.corners[None])[0] > 0.0
+    ]
+
+
+def _blocker(
+    target: SceneObject, in_sight: list[tuple[SceneObject, Float64]], spot: Float64
+) -> SceneObject | None:
+    """The first object of `_in_sight` that is between a spot and the target."""
+    line = np.array([spot, target.footprint.center])
+    low, high = line.min(axis=0), line.max(axis=0)
+    for item, corners in in_sight:
+        is_beside = (corners.max(axis=0) < low).any() or (corners.min(axis=0) > high).any()
+        if not is_beside and polygon_gap_m(line, corners) == 0.0:
             return item
     return None
 

@@ -316,6 +316,8 @@ class NodeRecords:
     def merge(self, graph: GlobalGraph, kept: int, removed: int) -> None:
         """Combine the records of the nodes of two slots that the graph has merged."""
         record = self.rows[kept]
+        # The frame that has just detected either must not forget both.
+        record["last_frame"] = max(record["last_frame"], self.rows["last_frame"][removed])
         beliefs.merge(record, self.rows[removed], graph.nodes.means[kept])
         certain = beliefs.most_certain(record, self.rows[removed])
         beliefs.start(record, graph.nodes.class_probabilities[kept].copy(), certain)

@@ -142,6 +142,22 @@ def test_an_improbable_node_is_forgotten() -> None:
     assert len(walk.graph) == 0
 
 
+def test_a_merged_node_was_last_detected_when_either_was() -> None:
+    """Else the frame that merges a new node into an improbable one forgets both."""
+    walk = Walk()
+    walk.see()
+    walk.miss(50, step_m=5.0)
+    beside = HERE + np.array([0.3, 0.0, 0.0], np.float32)
+    local = frame(0, (beside, CUP), scores=np.ones(1), stamp_ns=walk.stamp_ns + 1)
+    walk.merging.merge(walk.graph, local)
+    records, slot_of = walk.merging._records, walk.graph.nodes.slot_of
+    first, second = records.rows["last_frame"][[slot_of[1], slot_of[2]]]
+    assert first < second
+    walk.graph.merge_nodes(1, 2)
+    records.merge(walk.graph, slot_of[1], int(1 - slot_of[1]))
+    assert records.rows["last_frame"][slot_of[1]] == second
+
+
 def test_a_loaded_node_is_published(tmp_path: Path) -> None:
     walk = Walk()
     walk.see(10)

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from home import RADIUS_M, ROBOT_M, Home
-from robot import CAMERA_M, TILT_RAD, Planner, plan_pose
+from robot import CAMERA_M, TILT_RAD, Robot, length_m, plan_pose
 
-from deworldsg_ros.client.goals import Goal
 from deworldsg_ros.client.goals import Robot as Footprint
 from deworldsg_ros.client.grammar import Pattern, parse
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
-from deworldsg_ros.client.questions import ask
+from deworldsg_ros.client.questions import Answer, ask
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.baselines import BaselinePipeline, Fross
 from deworldsg_ros.evaluation.front_ends import TRUE_PROBABILITY, AnnotatedBoxes
@@ -44,7 +43,15 @@ FRAME_FAULTS = FrameFaults(flip=0.1, miss=0.1, jitter_px=2.0)
 FAULTS = Faults(label=0.05, false=0.5)
 # An answer that is less probable is none; those that are about as probable as the best are equal.
 LEAST, EQUAL = 0.15, 0.8
-DISTANCES_M = (0.7, 1.0, 1.3)
+# From the box of a thing. Where it is near already, the robot goes no nearer than it has to; across
+# a bed, there is no nearer place.
+DISTANCES_M, FAR_M = (1.2, 0.9, 0.7), 1.4
+# Another side is tried if the path is so many times longer than the straight line.
+DIRECT = 1.5
+# Places that are nearer than this see the same.
+APART_M = 0.4
+# Sides of the same object may be measured as so many times larger from another place.
+MOST_LARGER = 2.2
 # So far below the horizon does the camera see, with a margin.
 SEES_DOWN_RAD = TILT_RAD + math.radians(18)
 
@@ -171,13 +178,52 @@ Resolve = Callable[[SceneGraph, str, np.ndarray], "SceneObject | None"]
 
 def by_question(graph: SceneGraph, words: str, at: np.ndarray) -> SceneObject | None:
     """The best answer to the question, of equal ones the nearest; None = none can be believed."""
+    found = answers_to(graph, words, at, LEAST)
+    return found[0].item if found else None
+
+
+def answers_to(graph: SceneGraph, words: str, at: np.ndarray, least: float) -> list[Answer]:
+    """The answers that are as probable; of those about as probable as the best, the nearest first.
+
+    Args:
+        graph: that is asked.
+        words: the question.
+        at: x, y and yaw (3,) of the robot, in the frame of the graph.
+        least: the least probability of an answer.
+    """
     try:
-        found = [one for one in ask(graph, words).found if one.probability >= LEAST]
+        found = [one for one in ask(graph, words).found if one.probability >= least]
     except ClientError:  # a name that the graph has not
-        return None
+        return []
     if not found or _is_ordered(words):
-        return found[0].item if found else None
-    return _nearest([i.item for i in found if i.probability >= EQUAL * found[0].probability], at)
+        return found
+    equal = EQUAL * found[0].probability
+
+    def order(one: Answer) -> tuple[bool, float]:
+        gap_m = float(np.linalg.norm(np.array(one.item.position_m[:2]) - at[:2]))
+        return one.probability < equal, gap_m if one.probability >= equal else -one.probability
+
+    return sorted(found, key=order)
+
+
+def like(old: SceneObject, item: SceneObject) -> bool:
+    """Whether an object may be one that was elsewhere before: as large, and about as sure."""
+    a, b = (np.sort(np.maximum(one.size_m, 0.05)) for one in (old, item))
+    ratio = (b / a)[1:]
+    return bool((ratio < MOST_LARGER).all() and (ratio > 1 / MOST_LARGER).all())
+
+
+def bearers_asked(graph: SceneGraph, words: str) -> list[SceneObject]:
+    """What a thing is asked to be on: the desks of "cup on the desk"."""
+    asked = parse(words)
+    assert isinstance(asked, Pattern)
+    found: list[SceneObject] = []
+    for condition in asked.conditions:
+        try:
+            found += graph.objects(condition.thing, min_probability=0.3) if condition.thing else []
+        except ClientError:
+            continue
+    return found
 
 
 def _is_ordered(words: str) -> bool:
@@ -203,9 +249,8 @@ def by_label(graph: SceneGraph, words: str, at: np.ndarray) -> SceneObject | Non
 
 @dataclass(frozen=True)
 class Way:
-    """A goal that can be reached, and the path (n, 2) to it, in the frame of the robot's poses."""
+    """A pose (3,) to look from, and the path (n, 2) to it, in the frame of the robot's poses."""
 
-    goal: Goal
     pose: np.ndarray
     path: np.ndarray
 
@@ -213,26 +258,51 @@ class Way:
 def way_to(
     graph: SceneGraph,
     target: SceneObject,
-    planner: Planner,
+    robot: Robot,
     at_graph: np.ndarray,
-    at_map: np.ndarray,
     T_graph_map: np.ndarray,
+    avoid: Sequence[np.ndarray] = (),
 ) -> Way | None:
-    """The pose of `goal_near` that the planner reaches, of the first distance that has one."""
-    footprint = Footprint(RADIUS_M, ROBOT_M)
+    """The pose of `goal_near` that the planner reaches, of the first distance that has one.
+
+    Of its sides, the first one to which the way is about straight, else that of the shortest way.
+
+    Args:
+        graph: with the target.
+        target: to look at.
+        robot: its floor grid knows ways, and walls that hide the target.
+        at_graph: x, y and yaw (3,) of the robot, in the frame of the graph.
+        T_graph_map: from the frame of the robot's poses to that of the graph.
+        avoid: places (2,) from which the target was not in view.
+    """
+    footprint, planner = Footprint(RADIUS_M, ROBOT_M), robot.planner()
+    T_map_graph = invert_pose(T_graph_map)
+    at_map = robot.believed
+    own = np.array(target.position_m)
+    own_map = (T_map_graph @ [*own, 1.0])[:2]
+    angles = np.arange(4) * np.pi / 2
+    sides = own[:2] + 4.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     least_m = (CAMERA_M - target.height_m) / math.tan(SEES_DOWN_RAD)
-    for distance_m in [d for d in DISTANCES_M if d >= least_m] or DISTANCES_M[-1:]:
-        try:
-            goal = graph.goal_near(
-                target, distance_m, robot=footprint, towards=(*at_graph[:2].tolist(), 0.0)
-            )
-        except ClientError:
-            continue
-        T_map_graph = invert_pose(T_graph_map)
-        place = (T_map_graph @ [*goal.position_m, 1.0])[:2]
-        ahead = np.array(target.position_m) - goal.position_m
-        ahead = T_map_graph[:3, :3] @ ahead
-        path = planner.path(at_map[:2], place)
-        if path is not None:
-            return Way(goal, np.array([*place, np.arctan2(ahead[1], ahead[0])]), path)
+    best: tuple[float, Way] | None = None
+    away_m = float(np.linalg.norm(own[:2] - at_graph[:2]))
+    distances_m = (FAR_M, *DISTANCES_M) if away_m < 2 * FAR_M else (*DISTANCES_M, FAR_M)
+    for distance_m in [d for d in distances_m if d >= least_m] or [FAR_M]:
+        for x, y in [at_graph[:2].tolist(), *sides.tolist()]:
+            try:
+                goal = graph.goal_near(target, distance_m, robot=footprint, towards=(x, y, 0.0))
+            except ClientError:
+                break
+            place = (T_map_graph @ [*goal.position_m, 1.0])[:2]
+            path = None
+            if not any(np.linalg.norm(place - other) < APART_M for other in avoid):
+                path = None if robot.grid.hides(place, own_map) else planner.path(at_map, place)
+            if path is None:
+                continue
+            ahead, path_m = own_map - place, length_m(path)
+            if best is None or path_m < best[0]:
+                best = path_m, Way(np.array([*place, np.arctan2(ahead[1], ahead[0])]), path)
+            if path_m < DIRECT * float(np.linalg.norm(place - at_map[:2])) + 0.5:
+                break
+        if best is not None:
+            return best[1]
     return None

@@ -26,6 +26,8 @@ SPEED_M_S, TURN_RAD_S = 0.9, math.radians(100)
 CAMERA_M, TILT_RAD = 1.2, math.radians(22)
 CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
 RANGE_M = 5.0
+# What is higher hides what is behind it, but for what is so near to the target, such as its wall.
+TALL_M, NEAR_TARGET_M = 1.1, 0.3
 # Odometry drifts; every few metres the localisation of the robot takes that back, but for a rest.
 DRIFT = PoseNoise(jitter_m=0.003, jitter_deg=0.1, drift_m_per_m=0.01, drift_deg_per_m=0.3)
 CORRECTED_EVERY_M, REST_M, REST_RAD = 3.0, 0.02, math.radians(0.4)
@@ -110,18 +112,20 @@ class Grid:
     Attributes:
         corner: (2,) of the first cell, metres.
         hits, passes: (rows, columns) how often each cell was seen occupied, and free.
+        tall: (rows, columns) how often something was seen there as high as the camera.
     """
 
     corner: np.ndarray
     hits: np.ndarray
     passes: np.ndarray
+    tall: np.ndarray
 
     @classmethod
     def around(cls, home: Home) -> Grid:
         """Cells that are enough for a home."""
         x0, y0, x1, y1 = home.extent()
         shape = int((y1 - y0 + 2) / CELL_M), int((x1 - x0 + 2) / CELL_M)
-        return cls(np.array([x0 - 1, y0 - 1]), np.zeros(shape), np.zeros(shape))
+        return cls(np.array([x0 - 1, y0 - 1]), *(np.zeros(shape) for _ in range(3)))
 
     def see(self, depth_m: np.ndarray, T_map_camera: np.ndarray) -> None:
         """Add a depth image."""
@@ -129,11 +133,9 @@ class Grid:
         rays = rays_of(np.array([CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]) / 8, small.shape)
         rays = rays @ T_map_camera[:3, :3].T
         points = T_map_camera[:3, 3] + rays * small[..., None]
-        seen = (small > 0) & (points[..., 2] > 0.1) & (points[..., 2] < ROBOT_M)
-        hit = np.zeros(self.hits.shape, np.uint8)
-        columns, rows = np.floor((points[seen][:, :2] - self.corner) / CELL_M).astype(int).T
-        inside = (rows >= 0) & (columns >= 0) & (rows < len(hit)) & (columns < hit.shape[1])
-        hit[rows[inside], columns[inside]] = 1
+        seen = (small > 0) & (points[..., 2] > 0.1)
+        hit = self._cells_of(points[seen & (points[..., 2] < ROBOT_M)])
+        self.tall += self._cells_of(points[seen & (points[..., 2] > TALL_M)])
         free = np.zeros(self.hits.shape, np.uint8)
         # Every second row of rays leaves no gap.
         rays, ends = rays[::2], small[::2].astype(np.float64)
@@ -142,6 +144,35 @@ class Grid:
         self.hits += hit
         # What is seen through at one height may be occupied at another one.
         self.passes += 0.3 * ((free > 0) & (hit == 0))
+
+    def _cells_of(self, points: np.ndarray) -> np.ndarray:
+        """The cells (rows, columns) uint8 in which points (n, 3) are: 1, else 0."""
+        cells = np.zeros(self.hits.shape, np.uint8)
+        columns, rows = np.floor((points[:, :2] - self.corner) / CELL_M).astype(int).T
+        inside = (rows >= 0) & (columns >= 0) & (rows < len(cells)) & (columns < cells.shape[1])
+        cells[rows[inside], columns[inside]] = 1
+        return cells
+
+    def touch(self, place: np.ndarray, yaw: float) -> None:
+        """Note that a robot at a place (2,) touched something ahead, so that it plans round it."""
+        edge = place + (RADIUS_M + CELL_M) * np.array([math.cos(yaw), math.sin(yaw)])
+        self.hits += 20 * self._cells_of(np.array([[*edge, 0.0]]))
+
+    def hides(self, place: np.ndarray, target: np.ndarray) -> bool:
+        """Whether a wall, or what is as high, is between a place (2,) and a target (2,).
+
+        A line that leaves the grid is behind the walls.
+        """
+        way = target - place
+        far_m = float(np.linalg.norm(way)) - NEAR_TARGET_M
+        if far_m <= 0.0:
+            return False
+        steps = np.arange(0.0, far_m, CELL_M / 2)[:, None]
+        line = place + steps * way / np.linalg.norm(way)
+        columns, rows = np.floor((line - self.corner) / CELL_M).astype(int).T
+        inside = (np.minimum(rows, columns) >= 0) & (rows < len(self.tall))
+        inside &= columns < self.tall.shape[1]
+        return not inside.all() or bool((self.tall[rows, columns] >= 3).any())
 
     def clearance(self) -> np.ndarray:
         """Distance (rows, columns) of each free cell from what is occupied or unknown, metres."""
@@ -310,6 +341,7 @@ class Robot:
             self.pose[:2] = new
         else:
             self.bumps += 1
+            self.grid.touch(np.array([x, y]), yaw + turn)
         self.trail.append(self.pose.copy())
         self.T_map_camera = self.odometry.pose(looking(*self.pose))
         return moved
