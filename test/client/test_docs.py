@@ -62,6 +62,8 @@ def page(root_dir, demo_out, monkeypatch):
     builder.space = seen_room()
     builder.find_rooms()
     write_map(builder, Path("room.map"))
+    poses = [f"{stamp / 10} 0.1 0 0 0 0 0 1\n" for stamp in range(1, 8)]
+    Path("slam.txt").write_text("".join(poses))
     return blocks(root_dir / "docs" / "use_the_graph.md")
 
 
