@@ -21,7 +21,7 @@ SAME_M = 0.4
 # A surface is looked at if it was seen from so near, and in this many checks.
 LOOKED_M, CHECK_FRAMES = 2.5, 4
 # From near, a thing is what it was asked for if the answer is as probable.
-SURE = 0.35
+SURE = 0.25
 # Before the robot says that a thing is not there, it looks at what may be it.
 DOUBTFUL = 0.05
 # What never was in the graph is not sought farther than that.
