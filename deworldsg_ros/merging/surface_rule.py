@@ -212,7 +212,7 @@ class SurfaceMerging:
         records, found = self._records, False
         for column, rows in several_on_one(local, matches):
             slot = int(matches.slots[column])
-            if records.joint.are_several(slot, local.T_world_camera[:3, 3]):
+            if records.joint.add_several(slot, local.T_world_camera[:3, 3]):
                 surfaces = [local.surface_points_world[row] for row in rows]
                 found |= records.keep_largest(graph, slot, surfaces)
         return found
