@@ -272,7 +272,8 @@ def follow_trajectory(path: Path, trajectory_path: Path) -> EditReply:
             raise ConfigurationError(
                 f"map {path} has no poses of its frames: expected a map of this release"
             )
-        seen_ns = [int(nodes.first_seen_ns[nodes.slots].min(initial=2**62)), builder.newest_ns]
+        newest_ns = builder.newest_ns
+        seen_ns = [int(nodes.first_seen_ns[nodes.slots].min(initial=newest_ns)), newest_ns]
         if stamps_ns[-1] < seen_ns[0] or stamps_ns[0] > seen_ns[1]:
             raise ConfigurationError(
                 f"trajectory {trajectory_path} has poses {_span(stamps_ns)}, and map {path} frames "
