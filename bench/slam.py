@@ -380,7 +380,7 @@ def main() -> None:
     parser.add_argument("rooms", type=Path, nargs="?")
     parser.add_argument("--scan", default="")
     parser.add_argument("--quick", action="store_true", help="a small map and few frames")
-    parser.add_argument("--drifts", type=int, help="so many drifts in random directions")
+    parser.add_argument("--drifts", type=int, help="number of drifts, each in a random direction")
     parser.add_argument("--picture", type=Path, help="write a moving picture, no figures")
     options = parser.parse_args()
     if options.picture is not None:

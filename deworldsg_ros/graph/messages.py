@@ -166,8 +166,8 @@ MIN_CUT, MAX_SEEN, MIN_ELSEWHERE = 2, 0.1, 5
 # below its points: masks end a little above. A frame counts if it shows it below at least MIN_BELOW
 # points.
 MIN_RESTS, RESTS, MIN_BELOW = 3, 9, 3
-# Nothing floats. If an object is seen from all sides, and so many frames show that nothing is just
-# below it, its masks lack a lower part, such as the legs of a chair.
+# No object hangs in the air. If one was seen from all sides, and at least MIN_HANGING frames show
+# free space just below it, its masks lack a lower part, such as the legs of a chair.
 MIN_HANGING = 4
 # The heading of a room is that of most objects with a side so long, if their headings agree so
 # much: 1 is all of them.

@@ -21,8 +21,9 @@ from deworldsg_ros.scene.arrays import Bool, Float32, Int64, UInt16, UInt32, UIn
 _GOLDEN_GAMMA = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
-# A point that moves tries so many last bits for a hash that is as small as it was. Then a sample is
-# worth at least so many times its size, against the points of later frames.
+# A surface keeps the points with the smallest hashes. A point that moves gets a new hash, so up to
+# TRIES variants of its last bits are tried for one that is as small as before. Otherwise the points
+# of the next frame would take its place.
 TRIES = 64
 
 NO_POINTS: Float32 = np.zeros((0, 3), np.float32)
@@ -126,9 +127,8 @@ def _add(
         count = 0
         for point in range(starts[index], starts[index + 1]):
             least = _hash(new_bits[point])
-            if (
-                least > most[index]
-            ):  # its last bits are changed, within its millimetre: its cells stay
+            if least > most[index]:
+                # Its last bits change within its millimetre, so that it stays in its cell.
                 best, tried = new_bits[point], new_bits[point].copy()
                 tried[:] += np.uint32(TRIES)
                 here, there = best.view(np.float32), tried.view(np.float32)
