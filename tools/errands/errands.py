@@ -239,13 +239,13 @@ class Errands:
     def run(self, task: Task) -> Outcome:
         """Ask the robot, and judge what it does."""
         start, before_m = self.robot.pose.copy(), self.robot.path_m
-        target, reached = self.seeker.fetch(task.words)
+        target = self.seeker.fetch(task.words)
         path_m = self.robot.path_m - before_m
         said = "not there" if target is None else f"{target.name} at {target.position_m}"
         T = self.mind.T_graph_map
         chosen = None if target is None else self._right_one(target, task, T)
         shortest_m = self.referee.shortest_m(start, task, chosen) if task.right else 0.0
-        failure = self._judge(task, target, chosen, reached)
+        failure = self._judge(task, target, chosen)
         if not failure and chosen is not None and _is_long(path_m, shortest_m):
             failure = "path too long"
         return Outcome(
@@ -253,16 +253,12 @@ class Errands:
             tuple(self.seeker.told),
         )  # fmt: skip
 
-    def _judge(
-        self, task: Task, target: SceneObject | None, chosen: int | None, reached: bool
-    ) -> str:
+    def _judge(self, task: Task, target: SceneObject | None, chosen: int | None) -> str:
         """The stage that failed, but for the length of the path."""
         if not task.right:
             return "" if target is None else "claimed"
         if chosen is None:
             return self.referee.why_missed(task, self.mind.graph(), self.mind.T_graph_map)
-        if not reached:
-            return "unreachable"
         return "" if self.referee.is_in_view(self.robot.pose, (chosen,)) else "not in view"
 
     def _right_one(self, target: SceneObject, task: Task, T_graph_map: np.ndarray) -> int | None:

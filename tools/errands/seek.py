@@ -132,8 +132,8 @@ class Seeker:
 
     # --- An errand.
 
-    def fetch(self, words: str) -> tuple[SceneObject | None, bool]:
-        """The thing that the robot stands before at the end, and whether it got there.
+    def fetch(self, words: str) -> SceneObject | None:
+        """The thing that the robot stands before at the end; None = it says that it is not there.
 
         It goes to the best answer. There, it looks whether the thing is in view and still an
         answer. If it is not, it goes on to what is as sure and as large, then to the furniture that
@@ -168,7 +168,7 @@ class Seeker:
                 seen, reached = self.visit(target)
                 self._tell("to", target, "seen" if seen else "reached" if reached else "no way")
                 if seen is not None and self._is_answer(seen, words, old):
-                    return seen, True
+                    return seen
                 wrong.append(seen or target)
                 if seen is not None:
                     wrong.append(target)
@@ -190,7 +190,7 @@ class Seeker:
                 if next_answer() is None:
                     self.turn_round()
             self._note_looked(looked)
-        return None, True
+        return None
 
     def _tell(self, what: str, item: SceneObject, end: str = "") -> None:
         place = " ".join(f"{value:.2f}" for value in item.position_m)
