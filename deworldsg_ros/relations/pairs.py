@@ -30,7 +30,7 @@ from deworldsg_ros.relations.physics import PairInputs, PhysicsModel
 from deworldsg_ros.relations.rules import Scene
 from deworldsg_ros.relations.states import BELIEF, NEAR, NONE, SHAPE
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
-from deworldsg_ros.scene.vocabulary import CARRY_ON_TOP, SEATS, TABLES
+from deworldsg_ros.scene.vocabulary import CARRY_ON_TOP, TABLE_SEATS, TABLES_WITH_SEATS
 
 # Logit of every relation of a pair that is out of reach. The simulated rooms have none there.
 APART_LOGIT = -12.0
@@ -41,6 +41,8 @@ FLOOR_STEP_M = 0.02
 # Steps of the components of the up direction, so that it changes less often: every change means
 # that all pairs are judged anew. The error is at most half a degree.
 UP_STEP = 0.01
+# What is longer is no chair at a table, whatever its class is called: a couch.
+MAX_SEAT_M = 1.2
 # Pairs in arrays at once, so that a whole map needs no large ones.
 AT_ONCE = 1024
 
@@ -110,7 +112,8 @@ class PairTable:
         names = self._known_names = self._graph.vocabulary.classes
         self._inputs = PairInputs(names)
         self._on_top = np.array([name in CARRY_ON_TOP for name in names], np.bool_)
-        self._seating = np.array([[name in TABLES, name in SEATS] for name in names], np.float64)
+        seating = [[name in TABLES_WITH_SEATS, name in TABLE_SEATS] for name in names]
+        self._seating = np.array(seating, np.float64)
 
     @property
     def scene(self) -> Scene:
@@ -141,7 +144,7 @@ class PairTable:
         """
         beliefs, (one, other) = self.beliefs, self.shapes[self._graph.pairs.rows["slots"][rows].T]
         near = beliefs["judged"][rows] & np.isfinite(beliefs["gap_m"][rows])
-        gaps = plan_gaps(one, other)
+        gaps = np.maximum(plan_gaps(one, other), 0.0)
         steps = one["low"][:, 2] - other["high"][:, 2], other["low"][:, 2] - one["high"][:, 2]
         return Between(*(np.rint(100.0 * values) / 100.0 + 0.0 for values in (gaps, *steps))), near
 
@@ -250,7 +253,9 @@ class PairTable:
         surfaces = nodes.surface_points_world, nodes.surface_counts
         measure(shapes, slots, *surfaces, self._R_up_world)
         classes = self._classes(slots)
-        shapes["seating"][slots] = classes @ self._seating > 0.5
+        seating = classes @ self._seating > 0.5
+        seating[:, 1] &= (shapes["high"] - shapes["low"])[slots, :2].max(axis=1) <= MAX_SEAT_M
+        shapes["seating"][slots] = seating
         best = classes.argmax(axis=1)
         differ = slots[shapes["best_class"][slots] != best]
         shapes["best_class"][slots] = best

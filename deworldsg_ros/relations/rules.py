@@ -50,16 +50,23 @@ CENTRE_FRACTION = 0.1
 SEAT_GAP_M = 0.35
 # Scale of the error of the difference of two such distances.
 RANK_SPREAD_M = 0.02
-# A definition holds or not; measured surfaces are wrong in some of the pairs. Whatever the votes
-# are, one of seven sure ones is wrong in simulated rooms that nothing was fitted to.
-NEAR_CERTAINTY, MAX_NEAR = 0.97, 0.85
+# Near, on one support: two things do not stand in one place. Outlines that are deeper in each other
+# are of things in a pile; those of books in a row overlap less.
+OVERLAP_M, OVERLAP_SPREAD_M = 0.06, 0.02
+# Near: outlines closer than this have nothing between them. Something lies between two if it is
+# higher than this part of the height that they share.
+BETWEEN_GAP_M, BETWEEN_HEIGHT = 0.015, 0.25
+# Pairs with something between them are near so much less often, in simulated rooms.
+BETWEEN_WORTH = 0.8
+# Near before the votes, where the geometry denies it, and where it is sure: nodes are wrong, and
+# hidden neighbours are nearer (fitted to simulated rooms).
+LEAST_NEAR, MOST_NEAR = 0.04, 0.7
 
 
 # Objects are not stacked deeper. Longer circles of supports are not cut.
 MAX_CIRCLE = 64
-# A pair that is near with this probability, and in no more specific relation, counts as a
-# neighbour when neighbours are ranked.
-MIN_NEIGHBOUR = 0.3
+# Neighbours that stand beside an object with this probability count by it when they are ranked.
+MIN_NEIGHBOUR = 0.05
 
 
 class Scene(NamedTuple):
@@ -125,7 +132,7 @@ def take_in(
         spoken |= belief.near_votes > 0.0 or belief.other_votes >= MIN_OTHER_VOTES
         belief.live = spoken or not apart
         if not belief.live:
-            belief.near, belief.eligible = 0.0, False
+            belief.near = belief.beside = 0.0
             belief.relations[:] = 0.0
             belief.relations[:, NONE] = 1.0
 
@@ -206,15 +213,14 @@ def find_neighbours(scene: Scene, slots: Int64) -> Int64:
     """Judge which pairs of some objects (k,) stand side by side on one support.
 
     Args:
-        scene: ``near`` and ``eligible`` are written.
+        scene: ``near`` and ``beside`` are written.
         slots: (k,) of the objects.
 
     Returns:
-        The objects, and those with a pair whose eligibility changed: they are to be ranked.
+        The objects, and those with a neighbour that counts otherwise: they are to be ranked.
     """
     shapes, firsts, pairs, beliefs = scene
     found = [slot for slot in slots]
-    states = np.empty(STATE_COUNT)
     for slot in slots:
         shapes[slot].mark = True
     for slot in slots:
@@ -227,7 +233,7 @@ def find_neighbours(scene: Scene, slots: Int64) -> Int64:
             belief, other = beliefs[row], pairs[row].slots[1 - end]
             if not belief.known:
                 continue
-            now = False
+            now = np.float32(0.0)
             belief.near = 0.0
             if not np.isinf(belief.gap_m):
                 # Probability that the other one rests on the same support.
@@ -237,14 +243,25 @@ def find_neighbours(scene: Scene, slots: Int64) -> Int64:
                     share = shapes[ends[1 - ((at - 1) & 1)]].share
                     together += beliefs[(at - 1) >> 1].kept[(at - 1) & 1] * share
                     at = pairs[(at - 1) >> 1].links[(at - 1) & 1]
+                gap_m, step_m = max(belief.gap_m, 0.0), abs(belief.bottom_step_m)
+                reach = SEAT_GAP_M if belief.with_[0] + belief.with_[1] > 0 else NEAR_FLOOR_M
                 floor = shapes[slot].on_floor * shapes[other].on_floor
-                belief.near = _beside(belief, floor, together)
-                _share(belief, states)
-                now = belief.near * states[0] > MIN_NEIGHBOUR
-            if now != belief.eligible and not shapes[other].mark:
+                # The sigmoid of x is 0.5 + 0.5 tanh(x / 2), whatever the size of x.
+                floor *= 0.5 + 0.5 * math.tanh(0.5 * (reach - gap_m) / NEAR_FLOOR_SPREAD_M)
+                for margin in (
+                    (NEAR_SUPPORT_M - gap_m) / NEAR_SUPPORT_SPREAD_M,
+                    (NEAR_LEVEL_M - step_m) / NEAR_LEVEL_SPREAD_M,
+                    (OVERLAP_M + belief.gap_m) / OVERLAP_SPREAD_M,
+                ):
+                    together *= 0.5 + 0.5 * math.tanh(0.5 * margin)
+                belief.near = min(floor + together, 1.0)
+                # Whatever else they are called: a chair at a table is the nearest thing of another.
+                now = np.float32(belief.near * (1.0 - belief.kept[0] - belief.kept[1]))
+                now = now if now > MIN_NEIGHBOUR else np.float32(0.0)
+            if now != belief.beside and not shapes[other].mark:
                 shapes[other].mark = True
                 found.append(np.int64(other))
-            belief.eligible = now
+            belief.beside = now
         _spread(scene, slot, 0.0)
     for slot in found:
         shapes[slot].mark = False
@@ -260,17 +277,6 @@ def _spread(scene: Scene, slot: int, factor: float) -> None:
         other = scene.pairs[row].slots[1 - end]
         scene.shapes[other].share = factor * scene.beliefs[row].kept[end]
         place = scene.pairs[row].links[end]
-
-
-@kernel
-def _beside(belief: Any, floor: float, together: float) -> float:
-    """Probability that two objects stand side by side, on the floor or together on a support."""
-    reach = SEAT_GAP_M if belief.with_[0] + belief.with_[1] > 0 else NEAR_FLOOR_M
-    floor *= 1.0 / (1.0 + math.exp(-(reach - belief.gap_m) / NEAR_FLOOR_SPREAD_M))
-    step_m = abs(belief.bottom_step_m)
-    together *= 1.0 / (1.0 + math.exp(-(NEAR_SUPPORT_M - belief.gap_m) / NEAR_SUPPORT_SPREAD_M))
-    together *= 1.0 / (1.0 + math.exp(-(NEAR_LEVEL_M - step_m) / NEAR_LEVEL_SPREAD_M))
-    return float(min(floor + together, 1.0))
 
 
 @kernel
@@ -302,51 +308,102 @@ def _share(belief: Any, states: Float64) -> None:
 
 @kernel
 def rank_neighbours(scene: Scene, slots: Int64) -> Int64:
-    """Find how probably each eligible pair of some objects (k,) is one of their `NEAREST`.
+    """Find how probably each neighbour of some objects (k,) is one of the `NEAREST`, and in view.
 
     Distances are measured with errors: another neighbour is nearer with a probability that follows
-    from the difference of both distances. These count as independent.
+    from the difference of both distances, times the probability that it is a neighbour. These count
+    as independent.
 
     Args:
-        scene: ``close`` is written.
+        scene: ``close`` and ``between`` are written.
         slots: (k,) of the objects.
 
     Returns:
-        Rows of the pairs whose ``close`` changed; some twice.
+        Rows of the pairs with another value; some twice.
     """
-    _, firsts, pairs, beliefs = scene
+    shapes, firsts, pairs, beliefs = scene
     changed = [np.int64(0)][:0]
     fewer = np.empty(NEAREST)
     for slot in slots:
-        places, distances = [np.int64(0)][:0], [0.0][:0]
+        places, distances, weights = [np.int64(0)][:0], [0.0][:0], [0.0][:0]
         place = firsts[slot]
         while place:
-            row, end = (place - 1) >> 1, (place - 1) & 1
-            if beliefs[row].eligible:
+            belief, end = beliefs[(place - 1) >> 1], (place - 1) & 1
+            if belief.beside > 0.0:
                 places.append(place)
-                distances.append(beliefs[row].gap_m + CENTRE_FRACTION * beliefs[row].centre_step_m)
-            elif beliefs[row].close[end] != 0.0:
-                beliefs[row].close[end] = 0.0
-                changed.append(np.int64(row))
-            place = pairs[row].links[end]
+                gap_m = max(np.float64(belief.gap_m), 0.0)
+                distances.append(gap_m + CENTRE_FRACTION * belief.centre_step_m)
+                weights.append(np.float64(belief.beside))
+            elif belief.close[end] != 0.0:
+                belief.close[end] = belief.between[end] = 0.0
+                changed.append(np.int64((place - 1) >> 1))
+            place = pairs[(place - 1) >> 1].links[end]
+        # Outlines of the neighbours, and last of the object: x, y, both diagonals, height.
+        outlines = np.empty((len(places) + 1, 5, 2))
+        for index in range(len(places) + 1):
+            item = slot
+            if index < len(places):
+                ends = pairs[(places[index] - 1) >> 1].slots
+                item = np.int64(ends[1 - ((places[index] - 1) & 1)])
+            shape, outline = shapes[item], outlines[index]
+            for axis in range(2):
+                outline[axis, 0], outline[axis, 1] = shape.low[axis], shape.high[axis]
+                outline[2 + axis, 0] = shape.slant_low[axis]
+                outline[2 + axis, 1] = shape.slant_high[axis]
+            outline[4, 0], outline[4, 1] = shape.low[2], shape.high[2]
         for index in range(len(places)):
+            row, end = (places[index] - 1) >> 1, (places[index] - 1) & 1
             # Probability that 0, 1, … of the others are nearer.
             fewer[:] = 0.0
             fewer[0] = 1.0
+            between, is_apart = 0.0, beliefs[row].gap_m > BETWEEN_GAP_M
             for other in range(len(places)):
                 if other == index:
                     continue
-                step = (distances[other] - distances[index]) / RANK_SPREAD_M
-                nearer = 1.0 / (1.0 + math.exp(min(max(step, -50.0), 50.0)))
+                step = (distances[index] - distances[other]) / RANK_SPREAD_M
+                nearer = weights[other] * (0.5 + 0.5 * math.tanh(0.5 * step))
                 for number in range(NEAREST - 1, 0, -1):
                     fewer[number] += nearer * (fewer[number - 1] - fewer[number])
                 fewer[0] *= 1.0 - nearer
-            row, end = (places[index] - 1) >> 1, (places[index] - 1) & 1
-            now = np.float32(fewer.sum())
-            if beliefs[row].close[end] != now:
-                beliefs[row].close[end] = now
+                if is_apart:
+                    covered = _covered(outlines[-1], outlines[index], outlines[other])
+                    between = max(between, weights[other] * covered)
+            close, hidden = np.float32(fewer.sum()), np.float32(between)
+            if beliefs[row].close[end] != close or beliefs[row].between[end] != hidden:
+                beliefs[row].close[end], beliefs[row].between[end] = close, hidden
                 changed.append(np.int64(row))
     return np.array(changed)
+
+
+@kernel
+def _covered(one: Float64, other: Float64, third: Float64) -> float:
+    """Part of the width of the corridor between two outlines (5, 2) in which a third one stands.
+
+    The corridor is the rectangle between both, along the axes or the diagonals, whichever sets them
+    farther apart.
+    """
+    bottom, top = max(one[4, 0], other[4, 0]), min(one[4, 1], other[4, 1])
+    if third[4, 1] < bottom + BETWEEN_HEIGHT * (top - bottom) or third[4, 0] >= top:
+        return 0.0
+    along, widest = 0, -1.0
+    for axis in range(0, 4, 2):
+        x, y = (
+            max(one[axis, 0], other[axis, 0]) - min(one[axis, 1], other[axis, 1]),
+            max(one[axis + 1, 0], other[axis + 1, 0]) - min(one[axis + 1, 1], other[axis + 1, 1]),
+        )
+        squared = max(x, 0.0) ** 2 + max(y, 0.0) ** 2
+        if squared > widest:
+            along, widest = (axis if x >= y else axis + 1), squared
+    across, part = along ^ 1, 0.0
+    for axis in (along, across):
+        first = max(one[axis, 0], other[axis, 0])
+        last = min(one[axis, 1], other[axis, 1])
+        low, high = min(first, last), max(first, last)
+        shared = min(high, third[axis, 1]) - max(low, third[axis, 0])
+        if shared <= 0.0:
+            return 0.0
+        part = shared / max(high - low, 0.01)
+    return min(part, 1.0)
 
 
 @kernel
@@ -390,12 +447,12 @@ def relate(scene: Scene, slots: Int64, more: Int64) -> Int64:
         for state in range(1, STATE_COUNT):
             now[0, RELATIONS_OF_STATE[state, 0]] += states[state]
             now[1, RELATIONS_OF_STATE[state, 1]] += states[state]
-        beside = NEAR_CERTAINTY * belief.near
+        beside = belief.near * (1.0 - BETWEEN_WORTH * max(belief.between[0], belief.between[1]))
         if belief.with_[0] + belief.with_[1] == 0:
             beside *= belief.close[0] * belief.close[1]
-        beside = min(max(beside, 1.0 - NEAR_CERTAINTY), NEAR_CERTAINTY)
+        beside = LEAST_NEAR + (MOST_NEAR - LEAST_NEAR) * beside
         logit = math.log(beside / (1.0 - beside)) + belief.near_votes
-        beside = MAX_NEAR / (1.0 + math.exp(-logit))
+        beside = 1.0 / (1.0 + math.exp(-logit))
         is_new = False
         for end in range(2):
             now[end, NEAR] = states[0] * beside

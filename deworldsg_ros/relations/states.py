@@ -89,8 +89,9 @@ BELIEF = np.dtype(
         # Both nodes have enough points. Then the logits are those of the physical model.
         ("judged", np.bool_),
         ("state_logits", np.float32, STATE_COUNT),
-        # Horizontal gap of the outlines; infinite out of reach. Difference of the heights of the
-        # bottoms, and horizontal distance of the centres, where in reach.
+        # Horizontal gap of the outlines, negative if they overlap; infinite out of reach.
+        # Difference of the heights of the bottoms, and horizontal distance of the centres, where in
+        # reach.
         ("gap_m", np.float32),
         ("bottom_step_m", np.float32),
         ("centre_step_m", np.float32),
@@ -105,12 +106,13 @@ BELIEF = np.dtype(
         ("with_", np.uint8, 2),
         ("live", np.bool_),
         # After what others exclude: that one end rests on the other; that both stand side by side;
-        # that the pair counts among neighbours; that it is one of the nearest of an end, for each
-        # end.
+        # the same and none carries the other, 0 if it is small; for each end, that the pair is one
+        # of its nearest, and that something beside it stands between.
         ("kept", np.float64, 2),
         ("near", np.float32),
-        ("eligible", np.bool_),
+        ("beside", np.float32),
         ("close", np.float32, 2),
+        ("between", np.float32, 2),
         ("relations", np.float32, (2, NONE + 1)),
         # Whether a prior may enter, by classes of subject and object; and a number for the
         # probabilities in the message, 0 = no message.

@@ -14,6 +14,9 @@ from deworldsg_ros.scene.arrays import Bool, Float64
 
 TABLES = frozenset({"table", "dining table", "desk", "counter", "bench"})
 SEATS = frozenset({"chair", "couch", "seat", "sofa", "stool"})
+# A table is with chairs. A bench carries as tables do, and is none; a couch is near a table.
+TABLES_WITH_SEATS = TABLES - {"bench"}
+TABLE_SEATS = SEATS - {"couch", "sofa"}
 STORAGE = frozenset(
     [
         "bookshelf", "cabinet", "drawer", "oven", "refridgerator", "refrigerator", "shelf",

@@ -102,6 +102,9 @@ class Followed:
         self.scene = scene_of(self.pairs, count)
         self.scene.shapes["floor_odds"] = np.exp(rng.normal(0, 3, count))
         self.scene.shapes["seating"] = rng.random((count, 2)) < 0.3
+        for low, high in (("low", "high"), ("slant_low", "slant_high")):
+            ends = rng.uniform(0, 1, (2, *self.scene.shapes[low].shape))
+            self.scene.shapes[low], self.scene.shapes[high] = np.sort(ends, axis=0)
         self.logits, self.votes = np.zeros((2, len(self.pairs), STATE_COUNT))
         self.near_logits, self.worth = np.zeros((2, len(self.pairs)))
         self.circles: list[set[int]] = []
@@ -109,7 +112,7 @@ class Followed:
     def change(self, rng: np.random.Generator, rows: np.ndarray) -> None:
         """Other evidence on pairs."""
         beliefs, count = self.scene.beliefs, len(rows)
-        gaps_m = np.where(rng.random(count) < 0.2, np.inf, rng.uniform(0, 0.6, count))
+        gaps_m = np.where(rng.random(count) < 0.2, np.inf, rng.uniform(-0.1, 0.6, count))
         beliefs["judged"][rows] = rng.random(count) < 0.9
         beliefs["gap_m"][rows] = np.where(beliefs["judged"][rows], gaps_m, np.inf)
         beliefs["bottom_step_m"][rows] = rng.normal(0, 0.08, count)
@@ -149,10 +152,8 @@ class Followed:
         tables, seats = (shapes["seating"][self.pairs, kind] > 0 for kind in range(2))
         with_ = (tables & seats[:, ::-1]).any(axis=1) & beliefs["judged"]
         with_ &= beliefs["gap_m"] <= rules.SEAT_GAP_M
-        steps = (beliefs[name] for name in ("gap_m", "bottom_step_m", "centre_step_m"))
-        near = near_probabilities(self.pairs, kept, on_floor, *steps, states[:, 0], with_)
-        near = np.clip(near, 1.0 - rules.NEAR_CERTAINTY, rules.NEAR_CERTAINTY)
-        near = rules.MAX_NEAR * expit(logit(near) + self.worth * self.near_logits)
+        near = near_probabilities(self.pairs, kept, shapes, on_floor, beliefs, with_)
+        near = expit(logit(near) + self.worth * self.near_logits)
         relations = np.zeros((len(self.pairs), 2, NONE + 1))
         for end in (0, 1):
             for state in range(1, STATE_COUNT):
