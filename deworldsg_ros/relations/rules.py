@@ -308,11 +308,14 @@ def _share(belief: Any, states: Float64) -> None:
 
 @kernel
 def rank_neighbours(scene: Scene, slots: Int64) -> Int64:
-    """Find how probably each neighbour of some objects (k,) is one of the `NEAREST`, and in view.
+    """Find how probably each neighbour of some objects (k,) is one of the `NEAREST`.
+
+    Also, how probably another neighbour stands between. It does so by the part of the corridor that
+    it takes, times the probability that it is a neighbour.
 
     Distances are measured with errors: another neighbour is nearer with a probability that follows
-    from the difference of both distances, times the probability that it is a neighbour. These count
-    as independent.
+    from the difference of both distances, times that of being a neighbour. These count as
+    independent.
 
     Args:
         scene: ``close`` and ``between`` are written.
@@ -334,7 +337,7 @@ def rank_neighbours(scene: Scene, slots: Int64) -> Int64:
                 gap_m = max(np.float64(belief.gap_m), 0.0)
                 distances.append(gap_m + CENTRE_FRACTION * belief.centre_step_m)
                 weights.append(np.float64(belief.beside))
-            elif belief.close[end] != 0.0:
+            elif belief.close[end] != 0.0 or belief.between[end] != 0.0:
                 belief.close[end] = belief.between[end] = 0.0
                 changed.append(np.int64((place - 1) >> 1))
             place = pairs[(place - 1) >> 1].links[end]

@@ -180,3 +180,27 @@ def test_relations_that_follow_are_those_of_all_pairs_at_once(seed: int, count: 
         differs = np.flatnonzero((relations != before).any(axis=(1, 2)))
         taken_in = rows[~followed.scene.beliefs["live"][rows]]
         assert set(differs.tolist()) <= {*changed.tolist(), *taken_in.tolist()}
+
+
+def outline(x: float, y: float, low: float = 0.0, high: float = 1.0) -> np.ndarray:
+    """Outline (5, 2) of a square of 1 m around a place."""
+    corners = np.array([[x + a, y + b] for a in (-0.5, 0.5) for b in (-0.5, 0.5)])
+    slant = corners @ np.array([[1, -1], [1, 1]]) * 0.5**0.5
+    ends = [np.array([part.min(axis=0), part.max(axis=0)]).T for part in (corners, slant)]
+    return np.concatenate([*ends, [[low, high]]])
+
+
+def test_what_stands_between_two_things() -> None:
+    here, there = outline(0, 0), outline(3, 0)
+    for third, part in (
+        (outline(1.5, 0), 1.0),
+        (outline(1.5, 0.75), 0.25),
+        (outline(1.5, 1.1), 0.0),  # beside the corridor
+        (outline(-1.2, 0), 0.0),  # behind one of them
+        (outline(1.5, 0, 0.0, 0.2), 0.0),  # lower than a quarter
+        (outline(1.5, 0, 1.0, 2.0), 0.0),  # on a board above
+    ):
+        for ends in ((here, there), (there, here)):
+            assert rules._covered(*ends, third) == part
+    # Two that stand askew have their corridor along a diagonal.
+    assert rules._covered(here, outline(2, 2), outline(1, 1)) == 1.0
