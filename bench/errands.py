@@ -5,6 +5,7 @@ python -m bench --only errands
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from bench.figures import Figure, Setup
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools" / "errands"))
 
-from errands import FIRST, HOMES, LABEL, US, run_all, shares, table
+from errands import COMPARED, EMBEDDED, FIRST, HOMES, LABEL, US, run_all, shares, table
 
 # What is asked of true boxes with faults: things that stayed, things that moved, and absent ones.
 TARGETS = {
@@ -20,13 +21,13 @@ TARGETS = {
     "moved": (("moved",), 0.8),
     "not_there": (("absent", "removed"), 0.95),
 }
-EMBEDDED_HOMES = 2
 
 
 def figures(setup: Setup) -> list[Figure]:
     """Figures of `python -m bench`; the embedded detector needs MuJoCo."""
-    homes = 1 if setup.quick else HOMES
-    outcomes = run_all(range(FIRST, FIRST + homes), "boxes", 2, others=True)
+    homes, compared = (1, 1) if setup.quick else (HOMES, COMPARED)
+    by_kind = run_all(FIRST, homes, compared, 0 if setup.quick or not _can_render() else EMBEDDED)
+    outcomes = by_kind["boxes"]
     print(table(outcomes))
     found = []
     for name, (kinds, target) in TARGETS.items():
@@ -44,20 +45,17 @@ def figures(setup: Setup) -> list[Figure]:
                 note=f"{right} of {count} errands in {homes} homes; true boxes with faults",
             )
         )
-    if not setup.quick:
-        found += _embedded()
+    embedded = by_kind["embedded"]
+    if embedded:
+        print(table(embedded))
+        right, count = shares(embedded, US, "relation", "order", "moved")
+        note = f"{right} of {count} errands in {EMBEDDED} homes; the detector on rendered images"
+        found.append(
+            Figure("errands_embedded", right / count, "share", more_is_better=True, note=note)
+        )
     return found
 
 
-def _embedded() -> list[Figure]:
-    try:
-        import mujoco  # noqa: F401  colours for the detector
-    except ImportError:
-        return []
-    outcomes = run_all(range(FIRST, FIRST + EMBEDDED_HOMES), "embedded", 2)
-    print(table(outcomes))
-    right, count = shares(outcomes, US, "relation", "order", "moved")
-    note = f"{right} of {count} errands in {EMBEDDED_HOMES} homes; the detector on rendered images"
-    return [
-        Figure("errands_embedded", right / max(count, 1), "share", more_is_better=True, note=note)
-    ]
+def _can_render() -> bool:
+    """Whether MuJoCo is there, for the colours."""
+    return importlib.util.find_spec("mujoco") is not None

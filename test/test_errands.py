@@ -112,8 +112,8 @@ def test_a_wall_hides_what_is_behind_it_and_a_table_does_not(tool):
         depth_m = np.full((480, 640), ahead_m, np.float32)
         for _ in range(3):
             grid.see(depth_m, T)
-        assert grid.hides(np.array([1.2, 1.0]), np.array([2.8, 1.0])) is is_hidden
-    assert grid.hides(np.array([-50.0, 1.0]), np.array([2.8, 1.0]))
+        assert grid.hides(np.array([[1.2, 1.0]]), np.array([[2.8, 1.0]])) == [is_hidden]
+    assert grid.hides(np.array([[-50.0, 1.0]]), np.array([[2.8, 1.0]])).all()
     low = robot.Grid.around(home)
     v = (np.arange(480) - 239.5)[:, None] / 525
     down = np.sin(robot.TILT_RAD) + v * np.cos(robot.TILT_RAD)
@@ -122,7 +122,7 @@ def test_a_wall_hides_what_is_behind_it_and_a_table_does_not(tool):
         depth_m = np.where(down > 0.1, 0.5 / down, 0.0).repeat(640, axis=1).astype(np.float32)
     for _ in range(3):
         low.see(depth_m, T)
-    assert low.hits.any() and not low.hides(np.array([1.2, 1.0]), np.array([2.8, 1.0]))
+    assert low.hits.any() and not low.hides(np.array([[1.2, 1.0]]), np.array([[2.8, 1.0]])).any()
 
 
 def test_answers_are_the_nearest_of_those_that_are_about_as_probable(tool):
@@ -141,6 +141,44 @@ def test_answers_are_the_nearest_of_those_that_are_about_as_probable(tool):
     assert [one.item.id for one in found] == [2, 1, 3]
     assert mind.answers_to(graph, "teapot", np.zeros(3), 0.15) == []
     assert mind.like(graph[1], graph[2]) and not mind.like(graph[1], graph[4])
+
+
+def test_a_robot_that_looks_at_all_furniture_sees_what_stands_on_it(tool):
+    robot_, look, home = tool("robot"), tool("look"), tool("home").build(3)
+    planner = robot_.Planner(*home.room_free(), 0.32)
+    start = planner.point(int(np.flatnonzero(planner.free.ravel())[0]))
+    robot = robot_.Robot(home, 3, np.array([*start, 0.0]))
+    furniture = [number for number in home.present if home.name(number) in look.SURFACES]
+    nodes = [
+        make_node(number, home.name(number), low, box=box_at((low + high) / 2, high - low))
+        for number, (low, high) in ((n, home.bounds(n)) for n in furniture)
+    ]
+    items = list(SceneGraph(make_graph(nodes)))
+    looked, seen = look.Looked(robot), np.zeros(len(home.items) + 1, int)
+    left, views = [len(looked.left(items))], 0
+    place = start
+    while place is not None:
+        for yaw in np.arange(12) * np.pi / 6:
+            robot.pose = np.array([*place, yaw])
+            robot.T_map_camera = robot_.looking(*robot.pose)
+            robot.look()
+            looked.note(items, np.eye(4))
+            seen = np.maximum(seen, np.bincount(robot.instances.ravel(), minlength=len(seen)))
+        looked.give_up(items, place, np.eye(4))
+        left.append(len(looked.left(items)))
+        views += 1
+        path = looked.next_view(items, np.eye(4))
+        place = None if path is None else path[-1]
+    things = [thing for thing, bearer in home.on.items() if bearer in furniture]
+    assert np.mean(seen[things] > 100) > 0.9
+    # It comes to an end, with fewer views than furniture.
+    assert (np.diff(left) <= 0).all() and left[-1] < 0.1 * left[0]
+    assert 3 <= views < len(furniture)
+    # It does not count what the camera did not show.
+    unseen = look.Looked(robot)
+    robot.depth_m = np.full_like(robot.depth_m, 0.3)
+    unseen.note(items, np.eye(4))
+    assert len(unseen.left(items)) == left[0]
 
 
 @pytest.mark.slow

@@ -295,7 +295,8 @@ def way_to(
             place = (T_map_graph @ [*goal.position_m, 1.0])[:2]
             path = None
             if not any(np.linalg.norm(place - other) < APART_M for other in avoid):
-                path = None if robot.grid.hides(place, own_map) else planner.path(at_map, place)
+                hidden = robot.grid.hides(place[None], own_map[None])[0]
+                path = None if hidden else planner.path(at_map, place)
             if path is None:
                 continue
             ahead, path_m = own_map - place, length_m(path)

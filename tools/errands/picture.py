@@ -17,6 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import cv2
 import numpy as np
 from errands import ROOT, Errands
+from mind import by_question
 from PIL import Image
 from tasks import standing_tasks
 
@@ -83,9 +84,10 @@ def main() -> None:
 
     def keep(frame, perceived) -> None:
         trail.append(errands.robot.believed)
-        shots.append((frame.rgb, drawn_map(errands, graph, trail, None)))
+        shots.append((frame.rgb, drawn_map(errands, graph, trail, target and target.id)))
 
     graph = errands.mind.graph()
+    target = by_question(graph, task.words, errands.seeker.at)
     errands.on_frame = keep
     outcome = errands.run(task)
     print(f"{task.words}: {outcome.failure or 'fulfilled'}; {outcome.said}")

@@ -26,6 +26,7 @@ SPEED_M_S, TURN_RAD_S = 0.9, math.radians(100)
 CAMERA_M, TILT_RAD = 1.2, math.radians(22)
 CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
 RANGE_M = 5.0
+NOISE_SPARE = 256
 # What is higher hides what is behind it, but for what is so near to the target, such as its wall.
 TALL_M, NEAR_TARGET_M = 1.1, 0.3
 # Odometry drifts; every few metres the localisation of the robot takes that back, but for a rest.
@@ -56,6 +57,8 @@ class Camera:
 
     def __init__(self, home: Home, view: MujocoView | None = None) -> None:
         self._triangles, self.view = Triangles(home), view
+        size = CAMERA.height + NOISE_SPARE, CAMERA.width + NOISE_SPARE
+        self._noise = np.random.default_rng(0).standard_normal(size, np.float32)
 
     def move(self) -> None:
         """See all objects where the home has them now."""
@@ -74,11 +77,13 @@ class Camera:
         rgb, depth, instances = self._triangles.render(T_world_camera, CAMERA)
         if self.view is not None:
             rgb = self.view.render(T_world_camera)
-        noise = rng.standard_normal(depth.shape, np.float32)
+        # A part of a larger image of noise: fresh noise for each frame takes as long as its masks.
+        row, column = rng.integers(0, NOISE_SPARE, 2)
+        noise = self._noise[row : row + depth.shape[0], column : column + depth.shape[1]]
         depth = depth + (0.0012 + 0.0019 * (depth - 0.4) ** 2) * noise
         bend = np.abs(cv2.Laplacian(depth, cv2.CV_32F)) > np.maximum(0.05, 0.03 * depth)
-        lost = bend & (rng.random(depth.shape, np.float32) < 0.5)
-        depth[lost | (depth > RANGE_M) | (depth < 0.25)] = 0.0
+        bend[bend] = rng.random(int(bend.sum())) < 0.5
+        depth[bend | (depth > RANGE_M) | (depth < 0.25)] = 0.0
         return rgb, depth, instances
 
 
@@ -158,21 +163,21 @@ class Grid:
         edge = place + (RADIUS_M + CELL_M) * np.array([math.cos(yaw), math.sin(yaw)])
         self.hits += 20 * self._cells_of(np.array([[*edge, 0.0]]))
 
-    def hides(self, place: np.ndarray, target: np.ndarray) -> bool:
-        """Whether a wall, or what is as high, is between a place (2,) and a target (2,).
+    def hides(self, places: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """Whether a wall, or what is as high, is between places and targets (n, 2).
 
         A line that leaves the grid is behind the walls.
         """
-        way = target - place
-        far_m = float(np.linalg.norm(way)) - NEAR_TARGET_M
-        if far_m <= 0.0:
-            return False
-        steps = np.arange(0.0, far_m, CELL_M / 2)[:, None]
-        line = place + steps * way / np.linalg.norm(way)
-        columns, rows = np.floor((line - self.corner) / CELL_M).astype(int).T
-        inside = (np.minimum(rows, columns) >= 0) & (rows < len(self.tall))
-        inside &= columns < self.tall.shape[1]
-        return not inside.all() or bool((self.tall[rows, columns] >= 3).any())
+        ways = targets - places
+        far_m = np.linalg.norm(ways, axis=1)
+        shares = np.maximum(far_m - NEAR_TARGET_M, 0.0) / np.maximum(far_m, 1e-9)
+        steps = np.linspace(0.0, 1.0, 2 + int(far_m.max(initial=0.0) / (CELL_M / 2)))
+        lines = places[:, None] + (steps * shares[:, None])[..., None] * ways[:, None]
+        columns, rows = np.moveaxis(np.floor((lines - self.corner) / CELL_M).astype(int), -1, 0)
+        shape = self.tall.shape
+        inside = (np.minimum(rows, columns) >= 0) & (rows < shape[0]) & (columns < shape[1])
+        walls = self.tall[np.where(inside, rows, 0), np.where(inside, columns, 0)] >= 3
+        return (walls | ~inside).any(axis=1)
 
     def clearance(self) -> np.ndarray:
         """Distance (rows, columns) of each free cell from what is occupied or unknown, metres."""
@@ -284,6 +289,7 @@ class Robot:
         path_m: length of its way so far.
         trail: true positions so far.
         bumps: how often it touched something.
+        depth_m, instances: newest depth image, and its true objects.
     """
 
     def __init__(
@@ -296,17 +302,18 @@ class Robot:
         self.stamp_ns, self.path_m, self.bumps, self.frames = 10**9, 0.0, 0, 0
         self.trail = [self.pose.copy()]
         self.instances = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
+        self.depth_m = np.zeros((CAMERA.height, CAMERA.width), np.float32)
         self._free, self._corner = home.room_free()
         self.T_map_camera = self.odometry.pose(looking(*self.pose))
 
     def look(self) -> RgbdFrame:
         """A frame from where it is."""
         T_true = looking(*self.pose)
-        rgb, depth_m, self.instances = self.camera.shoot(T_true, self.rng)
+        rgb, self.depth_m, self.instances = self.camera.shoot(T_true, self.rng)
         self.stamp_ns += int(1e9 / RATE_HZ)
         self.frames += 1
-        self.grid.see(depth_m, self.T_map_camera)
-        return RgbdFrame(self.stamp_ns, rgb, depth_m, CAMERA, self.T_map_camera, "map")
+        self.grid.see(self.depth_m, self.T_map_camera)
+        return RgbdFrame(self.stamp_ns, rgb, self.depth_m, CAMERA, self.T_map_camera, "map")
 
     @property
     def believed(self) -> np.ndarray:

@@ -4,30 +4,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
+from look import (
+    IN_VIEW_M,
+    IN_VIEW_PX,
+    LOOKED_M,
+    NEARER_M,
+    SURFACES,
+    Looked,
+    gap_m,
+    pixels_of,
+    views,
+    way_before,
+)
 from mind import LEAST, Mind, Way, answers_to, bearers_asked, like, way_to
 from robot import Robot
 
-from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.client.grammar import Pattern, parse
 from deworldsg_ros.client.objects import SceneObject
 
 # Places that the robot goes to in one errand, at most.
 MOST_PLACES = 16
 # Something so near is looked at from where the robot is, if it is seen from there.
-NEAR_ENOUGH_M = 1.4
+NEAR_ENOUGH_M = 1.35
 # A node is the same one if it is as near to where it was.
 SAME_M = 0.4
-# A surface is looked at if it was seen from so near, and in this many checks.
-LOOKED_M, CHECK_FRAMES = 2.5, 4
+# On the way, it asks the graph again after so many frames.
+CHECK_FRAMES = 4
 # From near, a thing is what it was asked for if the answer is as probable.
 SURE = 0.25
 # Before the robot says that a thing is not there, it looks at what may be it.
 DOUBTFUL = 0.05
 # What never was in the graph is not sought farther than that.
-MOST_SEEK_M = 16.0
-# Where a thing may have been put.
-SURFACES = ("dining table", "desk", "counter", "cabinet", "stand", "couch", "bed")
+MOST_SEEK_M = 24.0
+# What was as probable was there before; what it was like tells what it may be now.
+KNOWN = 0.5
 
 
 class Seeker:
@@ -40,8 +53,26 @@ class Seeker:
     """
 
     def __init__(self, robot: Robot, mind: Mind, frame: Callable[[], None]) -> None:
-        self.robot, self.mind, self.frame = robot, mind, frame
+        self.robot, self.mind, self._take = robot, mind, frame
         self.told: list[str] = []
+        self._looked = Looked(robot)
+        self._surfaces: list[SceneObject] = []
+        self._known: dict[str, SceneObject] = {}
+
+    def _frame(self) -> None:
+        """Take a frame, and note what it shows of the furniture."""
+        self._take()
+        self._looked.note(self._surfaces, self.mind.T_graph_map)
+
+    def _remember(self) -> None:
+        """Note what is in the graph, by name: it may be gone from there when it is asked for."""
+        for item in self.mind.graph():
+            known = self._known.get(item.label)
+            if item.probability >= max(KNOWN, known.probability if known else 0.0):
+                self._known[item.label] = item
+
+    def _note_surfaces(self) -> None:
+        self._surfaces = [item for item in self.mind.graph() if item.label in SURFACES]
 
     def follow(
         self, path: np.ndarray, *, true: bool = False, until: Callable[[], bool] | None = None
@@ -51,7 +82,7 @@ class Seeker:
         Args:
             path: in the frame of the robot's poses.
             true: whether somebody steers by what is true.
-            until: asked every `CHECK_FRAMES` frames.
+            until: asked after every frame.
         """
         stuck = 0
         for point in path[1:]:
@@ -61,10 +92,8 @@ class Seeker:
                     break
                 target = point - at[:2] + self.robot.believed[:2] if true else point
                 stuck = 0 if self.robot.step(target) else stuck + 1
-                self.frame()
-                if stuck > 3:
-                    return False
-                if until is not None and self.robot.frames % CHECK_FRAMES == 0 and until():
+                self._frame()
+                if stuck > 3 or (until is not None and until()):
                     return False
         return True
 
@@ -73,18 +102,18 @@ class Seeker:
         start = self.robot.believed[2]
         for part in range(1, 19):
             self.robot.turn(start + part * 2 * math.pi / 18)
-            self.frame()
+            self._frame()
 
     def _look_at(self, yaw: float, frames: int = 4) -> int:
         """Turn to a heading and look; returns the stamp before what is seen there."""
         for _ in range(20):
             reached = self.robot.turn(yaw)
             since_ns = self.robot.stamp_ns
-            self.frame()
+            self._frame()
             if reached:
                 break
         for _ in range(frames):
-            self.frame()
+            self._frame()
         return since_ns
 
     @property
@@ -93,35 +122,57 @@ class Seeker:
         return self.mind.believed(self.robot.T_map_camera)
 
     def _way(self, target: SceneObject, avoid: list[np.ndarray]) -> Way | None:
-        return way_to(self.mind.graph(), target, self.robot, self.at, self.mind.T_graph_map, avoid)
+        T = self.mind.T_graph_map
+        way = way_to(self.mind.graph(), target, self.robot, self.at, T, avoid)
+        if way is None and not avoid:
+            path = way_before(target, self.robot, np.linalg.inv(T))
+            way = None if path is None else Way(np.array([*path[-1], 0.0]), path)
+        return way
 
     # --- A look at one thing.
 
     def visit(self, target: SceneObject) -> tuple[SceneObject | None, bool]:
         """Go before a thing and look; the node that is in view there, and whether it was reached.
 
-        From where it is not in view, the robot tries one other side.
+        It stops as soon as the thing is in view from near. From where it is not in view, the robot
+        tries one other side.
         """
-        away_m = float(np.linalg.norm(np.array(target.position_m[:2]) - self.at[:2]))
-        if away_m - max(target.size_m[:2]) / 2 < NEAR_ENOUGH_M:
-            way = np.array(target.position_m[:2]) - self.at[:2]
-            turn = math.atan2(way[1], way[0]) - self.at[2]
-            seen = self._seen(target, self._look_at(turn + float(self.robot.believed[2])))
-            if seen is not None:
-                return seen, True
+        looked = False
         avoid: list[np.ndarray] = []
-        for _ in range(3):
-            chosen = self._way(target, avoid)
-            if chosen is None:
+        for trial in range(4):
+            if trial or not self._may_see(target):
+                way = self._way(target, avoid)
+                if way is None:
+                    break
+                until = None if trial else partial(self._may_see, target)
+                if self.follow(way.path, until=until):
+                    avoid.append(way.pose[:2])
+                elif trial or not self._may_see(target):
+                    continue
+            looked = True
+            seen = self._seen(target, self._turn_to(target))
+            if seen is not None and self._is_in_view(seen):
+                return seen, True
+            if len(avoid) == 2 or target.id not in self.mind.graph():
                 break
-            if self.follow(chosen.path):
-                avoid.append(chosen.pose[:2])
-                seen = self._seen(target, self._look_at(float(chosen.pose[2])))
-                if seen is not None or len(avoid) == 2:
-                    return seen, True
-                if target.id not in self.mind.graph():
-                    return None, True
-        return None, bool(avoid)
+        return None, looked
+
+    def _turn_to(self, target: SceneObject, frames: int = 4) -> int:
+        """Turn to a thing and look; returns the stamp before what is seen there."""
+        way = np.array(target.position_m[:2]) - self.at[:2]
+        turn = math.atan2(way[1], way[0]) - self.at[2]
+        return self._look_at(turn + float(self.robot.believed[2]), frames)
+
+    def _may_see(self, item: SceneObject) -> bool:
+        """Whether a thing is near, and nothing tall before it."""
+        if gap_m(item, self.at) > NEAR_ENOUGH_M:
+            return False
+        point = (np.linalg.inv(self.mind.T_graph_map) @ [*item.position_m, 1.0])[:3]
+        return bool(views(self.robot, self.robot.believed[None, :2], point[None], LOOKED_M)[0, 0])
+
+    def _is_in_view(self, item: SceneObject) -> bool:
+        near = gap_m(item, self.at) < IN_VIEW_M
+        return near and pixels_of(item, self.robot, self.mind.T_graph_map) > IN_VIEW_PX
 
     def _seen(self, target: SceneObject, since_ns: int) -> SceneObject | None:
         """The node of a target, if it was detected since a time."""
@@ -136,13 +187,19 @@ class Seeker:
         """The thing that the robot stands before at the end; None = it says that it is not there.
 
         It goes to the best answer. There, it looks whether the thing is in view and still an
-        answer. If it is not, it goes on to what is as sure and as large, then to the furniture that
-        it has not looked at since it was asked, the nearest first.
+        answer. If it is not, it goes on to the next one, then to places from which it sees
+        furniture that it has not looked at since it was asked. If the thing was elsewhere before,
+        only what is as large counts.
         """
         self.told = []
         since_ns, before_m = self.robot.stamp_ns, self.robot.path_m
+        asked = parse(words)
+        # Only what has no other mark than its name is still the same thing elsewhere.
+        may_move = isinstance(asked, Pattern) and not asked.conditions and asked.rank is None
         wrong: list[SceneObject] = []
-        looked: set[int] = set()
+        self._looked = Looked(self.robot)
+        self._note_surfaces()
+        self._remember()
         old: SceneObject | None = None
         first = True
 
@@ -156,41 +213,66 @@ class Seeker:
             return None
 
         def look_about() -> bool:
-            self._note_looked(looked)
+            if self.robot.frames % CHECK_FRAMES:
+                return False
+            self._note_surfaces()
             return next_answer() is not None
 
         for _ in range(MOST_PLACES):
             target = next_answer()
             if target is None and old is None and first:
                 first = False
+                old = self._known.get(str(asked.thing)) if may_move else None
                 target = next_answer(DOUBTFUL)
             if target is not None:
+                if target.first_seen_ns > since_ns and gap_m(target, self.at) > NEAR_ENOUGH_M:
+                    # What is new is looked at from here, before it is gone to.
+                    self._turn_to(target, 6)
+                    again = next_answer()
+                    if again is None or again.id != target.id:
+                        self._tell("no longer", target)
+                        continue
                 seen, reached = self.visit(target)
                 self._tell("to", target, "seen" if seen else "reached" if reached else "no way")
                 if seen is not None and self._is_answer(seen, words, old):
                     return seen
-                wrong.append(seen or target)
-                if seen is not None:
-                    wrong.append(target)
-                if old is None and seen is None and target.last_seen_ns <= since_ns:
+                wrong += [target] if seen is None else [target, seen]
+                was_there = target.last_seen_ns <= since_ns and target.probability >= KNOWN
+                if old is None and may_move and was_there and reached and seen is None:
                     old = target
                     self.turn_round()
-                    self._note_looked(looked)
                 continue
-            place = self._next_place(self.mind.graph(), words, old, looked)
             if old is None and self.robot.path_m - before_m > MOST_SEEK_M:
-                place = None
-            if place is None:
                 break
-            self._tell("seek at", place)
-            looked.add(place.id)
-            way = self._way(place, [])
-            if way is not None and self.follow(way.path, until=look_about):
-                self._look_at(float(way.pose[2]), 2)
-                if next_answer() is None:
-                    self.turn_round()
-            self._note_looked(looked)
+            if not self._seek(words, old, look_about):
+                break
         return None
+
+    def _seek(self, words: str, old: SceneObject | None, until: Callable[[], bool]) -> bool:
+        """Look at furniture that was not looked at; false if there is none.
+
+        What never was in the graph is sought on what it is asked to be on, if that is said.
+        """
+        self._note_surfaces()
+        asked = [] if old is not None else bearers_asked(self.mind.graph(), words)
+        items = asked or self._surfaces
+        if asked and self._looked.reach_m > NEARER_M:
+            # The graph knows these, and what is on them as seen from far.
+            self._looked = Looked(self.robot, NEARER_M)
+        T_map_graph = np.linalg.inv(self.mind.T_graph_map)
+        path = self._looked.next_view(items, T_map_graph)
+        if path is None and self._looked.reach_m > NEARER_M:
+            self._looked = Looked(self.robot, NEARER_M)
+            path = self._looked.next_view(items, T_map_graph)
+        if path is None:
+            return False
+        self.told.append(f"seek at {path[-1].round(2)}")
+        if self.follow(path, until=until):
+            self.turn_round()
+        elif until():
+            return True
+        self._looked.give_up(items, path[-1], T_map_graph)
+        return True
 
     def _tell(self, what: str, item: SceneObject, end: str = "") -> None:
         place = " ".join(f"{value:.2f}" for value in item.position_m)
@@ -201,43 +283,13 @@ class Seeker:
         for _ in range(2):
             found = answers_to(self.mind.graph(), words, self.at, LEAST)
             own = [one for one in found if one.item.id == seen.id]
+            best = ", ".join(f"#{one.item.id} {one.probability:.0%}" for one in found[:4])
+            self.told.append(f"answers there: {best or 'none'}")
             if own and own[0].probability >= SURE and (old is None or like(old, own[0].item)):
                 return True
             for _ in range(4):
-                self.frame()
+                self._frame()
         return False
-
-    def _note_looked(self, looked: set[int]) -> None:
-        """Note the furniture that is in view from near."""
-        now_ns, at = self.robot.stamp_ns, self.at
-        for item in self.mind.graph():
-            gap_m = float(np.linalg.norm(np.array(item.position_m[:2]) - at[:2]))
-            is_seen = item.last_seen_ns >= now_ns - CHECK_FRAMES * 2 * 10**8
-            if item.label in SURFACES and is_seen and gap_m < LOOKED_M:
-                looked.add(item.id)
-
-    def _next_place(
-        self, graph: SceneGraph, words: str, old: SceneObject | None, looked: set[int]
-    ) -> SceneObject | None:
-        """The nearest piece of furniture to look at; None = all were looked at.
-
-        What never was in the graph is sought on what it is asked to be on, if that is said.
-        """
-        asked = [] if old is not None else bearers_asked(graph, words)
-        items = asked or [item for item in graph if item.label in SURFACES]
-        items = [item for item in items if item.id not in looked]
-        if not items:
-            return None
-        planner = self.robot.planner()
-        found = planner.paths(self.robot.believed)
-        T_map_graph = np.linalg.inv(self.mind.T_graph_map)
-
-        def way_m(item: SceneObject) -> float:
-            place = (T_map_graph @ [*item.position_m, 1.0])[:2]
-            cell = planner.near(place, 2.0)
-            return math.inf if found is None or cell is None else float(found[0][cell])
-
-        return min(items, key=way_m)
 
 
 def is_same(a: SceneObject, b: SceneObject) -> bool:
