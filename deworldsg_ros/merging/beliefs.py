@@ -408,6 +408,6 @@ def merge(record: Any, other: Any, mean_world: Float64) -> None:
         record["view_detected"][to] = min(detected, record["view_shown"][to])
 
 
-def assume(record: Any, observations: int) -> None:
-    """Fill the record of a node that has no looks, from its number of observations."""
-    record["best_score"], record["looks"] = 0.9, max(observations, 3)
+def assume(record: Any, looks: float) -> None:
+    """Fill the record of a node that has no viewpoints, as if so many had detected it."""
+    record["best_score"], record["looks"] = 0.9, looks

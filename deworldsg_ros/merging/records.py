@@ -525,7 +525,7 @@ def _rebuild(records: NodeRecords, graph: GlobalGraph, slots: Int64) -> None:
     _name(records, graph, slots)
     records.map.add(slots, records.map.cells_of([nodes.surface(slot) for slot in slots]))
     for slot, observations in zip(slots, nodes.observations[slots].tolist()):
-        beliefs.assume(records.rows[slot], observations)
+        beliefs.assume(records.rows[slot], max(observations, 3))
 
 
 def _name(records: NodeRecords, graph: GlobalGraph, slots: Int64) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Protocol
 
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.floor_plan import Thing
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.editing import EditReply
@@ -43,6 +44,13 @@ class Merging(Protocol):
 
         Raises:
             RefusedInput: as `GlobalGraph.admit`.
+        """
+        ...
+
+    def add(self, graph: GlobalGraph, things: Sequence[Thing], stamp_ns: int) -> list[int]:
+        """Add a node without a name for each thing that no detector fires at; returns the ids.
+
+        The paper's rule has no such nodes.
         """
         ...
 

@@ -7,16 +7,19 @@ and nodes are matched one to one. If the classes differ, more overlap is require
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.extent import even_moments
+from deworldsg_ros.graph.floor_plan import Thing
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeBoxes, NodeStates
 from deworldsg_ros.graph.nodes import NodeTable
+from deworldsg_ros.merging import beliefs
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.editing import (
     EditReply,
@@ -41,6 +44,9 @@ from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vo
 
 # Gaussians are weighted by their number of pixels; this number gives weight 1.
 PIXELS_PER_WEIGHT = 1000.0
+# A thing that no detector fires at is as probable as one that so many viewpoints have detected:
+# 0.82 in a new graph (of those in rooms that chose nothing, 14 of 15 were things).
+SURE_AS_VIEWS = 2
 SPARE = Vocabulary(("a", "b"), ("on",))
 
 
@@ -120,6 +126,23 @@ class SurfaceMerging:
         self._judge_cells(graph, local, cells, node_ids, frame)
         node_ids = self._merge_parts(graph, local, matches, node_ids, view.slots)
         self._life_cycle.observe(graph, local, view, node_ids)
+        return node_ids
+
+    def add(self, graph: GlobalGraph, things: Sequence[Thing], stamp_ns: int) -> list[int]:
+        """See `Merging.add`."""
+        records, node_ids, count = self._records, [], len(graph.vocabulary.classes)
+        for points, keyframes in things:
+            classes, moments = np.full(count, 1.0 / count), even_moments(points)
+            node_id = graph.add_node(*moments, classes, stamp_ns, points, confirmed=False)
+            slot = graph.nodes.slot(node_id)
+            graph.nodes.set_surface(slot, points, keyframes)
+            records.add(slot, node_id, classes)
+            beliefs.assume(records.rows[slot], SURE_AS_VIEWS)
+            node_ids.append(node_id)
+        slots = graph.nodes.slots_of(node_ids)
+        records.map.add(slots, records.map.cells_of([thing.points_world for thing in things]))
+        records.place(graph, slots)
+        self._life_cycle.publish_again(graph, node_ids)
         return node_ids
 
     def hidden(self, graph: GlobalGraph) -> dict[int, str]:

@@ -507,10 +507,12 @@ class GraphKeeper:
         before: RoomMap,
         rooms: RoomMap,
         states: list[wire.RoomState],
+        add_things: Callable[[], None],
     ) -> None:
-        """Take rooms that were found, unless the graph or a name is another one now."""
+        """Take rooms and things that were found, unless the graph or a name is another one now."""
         if builder is self._builder and builder.rooms is before:
             builder.set_rooms(rooms, states)
+            add_things()
             self._times.changed(self._running_s, time.monotonic(), can_wait=True)
 
     def _correct(self, correct: Correct) -> None:
