@@ -6,13 +6,15 @@ The graph node and the in-process pipeline both use this, so that they give the 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph.edits import GraphEdit, NameRoom
-from deworldsg_ros.graph.floor_plan import Thing, Things
+from deworldsg_ros.graph.floor_plan import FoundThings, Things
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeBoxes, hidden_node
 from deworldsg_ros.graph.pairs import frame_votes
@@ -258,17 +260,23 @@ class GraphBuilder:
     def find_things(self) -> None:
         """Find things that no detector fires at, if configured; takes two seconds or more."""
         if self.things is not None and self.things.is_new:
-            found = self.things.find(self.up.up_world().tolist(), self.full().nodes)
-            self.add_things(found, self.things.moves)
-            self.things.is_new = False
+            self.add_things(self.search(self.full().nodes)())
 
-    def add_things(self, found: list[Thing], moves: int) -> None:
-        """Add things as nodes without a name, if the views have not moved (`Things.moves`) since.
+    def search(self, nodes: Sequence[wire.NodeState]) -> Callable[[], FoundThings]:
+        """What finds the things, in any thread, besides the nodes that were detected."""
+        if self.things is None or not self.things.is_new:
+            return lambda: FoundThings([], 0, -1)
+        self.things.is_new = False
+        views, up, things = copy(self.things), self.up.up_world().tolist(), self.merging.things()
+        return lambda: views.find(up, (node for node in nodes if node.id not in things))
 
-        The next `update` has them.
+    def add_things(self, found: FoundThings) -> None:
+        """Make things nodes without a name, unless the views have moved since they were found.
+
+        Those of before that are not found again go. The next `update` has the changes.
         """
-        if self.things is not None and self.things.moves == moves:
-            self.merging.add(self.graph, found, self.newest_ns)
+        if self.things is not None and self.things.moves == found.moves:
+            self.merging.add(self.graph, found)
 
     def set_rooms(self, rooms: RoomMap, states: list[wire.RoomState]) -> None:
         """Set the rooms, and their messages; the next `update` has them if they are others."""

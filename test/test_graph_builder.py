@@ -14,6 +14,7 @@ from support.room_nodes import DINNER, VOCABULARY, change, room
 from support.spaces import BOARD, ON_BOARD, walk_round
 
 from deworldsg_ros.config import Config, InputsConfig, MergingConfig, OutputConfig, RelationsConfig
+from deworldsg_ros.graph.edits import SetLabel
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
 from deworldsg_ros.scene.errors import RefusedInput
@@ -212,6 +213,32 @@ def test_what_no_detector_fires_at_is_a_node_without_a_name(tmp_path: Path) -> N
     assert [node.id for node in kept.full().nodes] == [table.id]
 
 
+def test_a_thing_that_its_own_views_do_not_show_any_more_goes() -> None:
+    config = Config(merging=MergingConfig(association="things"), inputs=InputsConfig(world_up="z"))
+    builder = GraphBuilder(config, VOCABULARY_OF_FRAMES, "world")
+    for frame in walk_round(BOARD, ON_BOARD, steps=36):
+        builder.integrate(frame)
+    found = builder.things.find((0.0, 0.0, 1.0), [])
+    assert (found.since_ns, found.moves) == (10**8, 0)
+    (thing,) = found.things
+    assert found.since_ns <= thing.first_ns < thing.last_ns <= 36 * 10**8
+    ghost = thing._replace(points_world=thing.points_world - np.float32((0.5, 0.1, 0.0)))
+    builder.add_things(found._replace(things=[thing, ghost]))
+    assert [node.id for node in builder.full().nodes] == [1, 2]
+    # These views are newer than the ghost: they cannot tell.
+    builder.add_things(found._replace(things=[thing], since_ns=thing.first_ns + 1))
+    assert [node.id for node in builder.full().nodes] == [1, 2]
+    # Of a thing that is found again, the newest surface counts.
+    more = thing._replace(points_world=thing.points_world + np.float32((0.03, 0.0, 0.0)))
+    before = builder.full().nodes[0].mean_m[0]
+    builder.add_things(found._replace(things=[more]))
+    (node,) = builder.full().nodes
+    assert node.id == 1 and node.mean_m[0] - before == pytest.approx(0.03, abs=1e-3)
+    builder.edit(SetLabel(1, "jar"))
+    builder.add_things(found._replace(things=[]))
+    assert [node.label for node in builder.full().nodes] == ["jar"]
+
+
 def test_things_follow_a_corrected_trajectory() -> None:
     config = Config(merging=MergingConfig(association="things"), inputs=InputsConfig(world_up="z"))
     builder = GraphBuilder(config, VOCABULARY_OF_FRAMES, "world")
@@ -227,5 +254,5 @@ def test_things_follow_a_corrected_trajectory() -> None:
     np.testing.assert_allclose(np.subtract(after.mean_m, before.mean_m), T[:3, 3], atol=2e-3)
     builder.find_things()
     assert len(builder.full().nodes) == 1
-    builder.add_things(found, 0)  # found where they were before the correction
+    builder.add_things(found)  # found where they were before the correction
     assert len(builder.full().nodes) == 1

@@ -233,10 +233,23 @@ class Glance(NamedTuple):
 
 
 class Thing(NamedTuple):
-    """Surface points (n, 3) float32 of a thing, metres, world, and their keyframes (n,)."""
+    """Surface points (n, 3) float32 of a thing, metres, world, and their keyframes (n,).
+
+    first_ns and last_ns are the stamps of the first and the last view that shows it.
+    """
 
     points_world: Float32
     keyframes: UInt16
+    first_ns: int
+    last_ns: int
+
+
+class FoundThings(NamedTuple):
+    """The things of the views since a stamp, and how often the views had moved (`Things`)."""
+
+    things: list[Thing]
+    since_ns: int
+    moves: int
 
 
 class Things:
@@ -245,6 +258,8 @@ class Things:
     Attributes:
         is_new: whether there are views since something was last looked for.
         moves: how often the views have moved: what was found before lies elsewhere now.
+
+    A copy keeps the views of its moment.
     """
 
     def __init__(self) -> None:
@@ -268,7 +283,6 @@ class Things:
         camera = per_px * np.array([i.fx, i.fy, i.cx, i.cy])
         self.is_new = True
         glance = Glance(local.stamp_ns, keyframe, grid.depth_mm, camera, pose)
-        # A copy of this object keeps the views of its moment.
         self._glances = [*self._glances[1 - MOST_GLANCES :], glance]
         self._poses = np.concatenate([self._poses[1 - MOST_GLANCES :], pose[None]])
 
@@ -284,7 +298,7 @@ class Things:
         """Drop all views: their keyframes have other numbers now."""
         self._glances, self._poses = [], self._poses[:0]
 
-    def find(self, up: Sequence[float], nodes: Iterable[wire.NodeState]) -> list[Thing]:
+    def find(self, up: Sequence[float], nodes: Iterable[wire.NodeState]) -> FoundThings:
         """The things that are none of the nodes; it takes some seconds.
 
         Args:
@@ -293,8 +307,10 @@ class Things:
         """
         glances, axes = self._glances, horizontal_axes(up)
         if not glances:
-            return []
+            return FoundThings([], 0, self.moves)
         cloud = _Cloud(glances, axes, [_ends(node.box, axes) for node in nodes if node.box])
+        stamps_ns = np.array([one.stamp_ns for one in glances])
+        keyframes = np.array([one.keyframe for one in glances], np.uint16)
         found: list[tuple[Float32, Thing]] = []
         supports = _supports(cloud)
         standing = [rows for one in supports for rows in _standing(cloud, one, supports)]
@@ -303,9 +319,11 @@ class Things:
             ends = np.quantile(points, (0.02, 0.98), axis=0)
             if any(_overlap(ends, other) for other, _ in found):
                 continue
-            keyframes = np.array([one.keyframe for one in glances], np.uint16)[cloud.of[rows]]
-            found.append((ends, Thing((points @ axes).astype(np.float32), keyframes)))
-        return [thing for _, thing in found]
+            seen_ns = stamps_ns[cloud.of[rows]]
+            span_ns = int(seen_ns.min()), int(seen_ns.max())
+            thing = Thing((points @ axes).astype(np.float32), keyframes[cloud.of[rows]], *span_ns)
+            found.append((ends, thing))
+        return FoundThings([thing for _, thing in found], int(stamps_ns.min()), self.moves)
 
 
 class _Cloud:
@@ -458,7 +476,7 @@ def _standing(cloud: _Cloud, support: _Support, supports: Sequence[_Support]) ->
     counts = np.zeros((*whole.shape, int(boxes[:, 2].max()) + 1), np.int64)
     np.add.at(counts, tuple(boxes.T), 1)
     solid = np.argwhere(counts > 1)
-    centers: Float64 = (solid + 0.5) * THING_CELL_M
+    centers = np.asarray((solid + 0.5) * THING_CELL_M, np.float64)
     centers[:, :2] += cloud.corner + first * THING_CELL_M
     centers[:, 2] += support.height_m + LIFT_M
     seen, through = _looks(cloud, centers)

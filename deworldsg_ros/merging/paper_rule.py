@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
-from deworldsg_ros.graph.floor_plan import Thing
+from deworldsg_ros.graph.floor_plan import FoundThings
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.graph.nodes import NodeTable
@@ -210,7 +210,11 @@ class PaperMerging:
         graph.add_relations(local, node_ids)
         return node_ids
 
-    def add(self, graph: GlobalGraph, things: Sequence[Thing], stamp_ns: int) -> list[int]:
+    def things(self) -> set[int]:
+        """See `Merging.things`."""
+        return set()
+
+    def add(self, graph: GlobalGraph, found: FoundThings) -> None:
         """See `Merging.add`."""
         raise AssertionError("the paper's rule has no nodes that were never detected")
 

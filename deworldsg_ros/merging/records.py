@@ -215,6 +215,13 @@ class NodeRecords:
         return np.flatnonzero(self.rows["node_id"])
 
     @property
+    def undetected(self) -> Int64:
+        """The slots of things that nothing has detected; see `beliefs.THING_LOOKS`."""
+        slots = self.slots
+        views, looks = self.rows["views"][slots], self.rows["looks"][slots]
+        return np.asarray(slots[(views == 0) & (looks == beliefs.THING_LOOKS)])
+
+    @property
     def ids(self) -> list[int]:
         """The nodes with a record."""
         node_ids: list[int] = self.rows["node_id"][self.slots].tolist()

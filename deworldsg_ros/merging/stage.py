@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import Protocol
 
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
-from deworldsg_ros.graph.floor_plan import Thing
+from deworldsg_ros.graph.floor_plan import FoundThings
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.editing import EditReply
@@ -47,10 +47,15 @@ class Merging(Protocol):
         """
         ...
 
-    def add(self, graph: GlobalGraph, things: Sequence[Thing], stamp_ns: int) -> list[int]:
-        """Add a node without a name for each thing that no detector fires at; returns the ids.
+    def things(self) -> set[int]:
+        """The nodes that were never detected: things that `add` has added."""
+        ...
 
-        The paper's rule has no such nodes.
+    def add(self, graph: GlobalGraph, found: FoundThings) -> None:
+        """Make each thing that no detector fires at a node without a name.
+
+        A thing of before keeps its node. It goes if its views were searched again, and it was not
+        found. The paper's rule has no such nodes.
         """
         ...
 

@@ -7,7 +7,7 @@ and nodes are matched one to one. If the classes differ, more overlap is require
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
 from deworldsg_ros.graph.extent import even_moments
-from deworldsg_ros.graph.floor_plan import Thing
+from deworldsg_ros.graph.floor_plan import FoundThings
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeBoxes, NodeStates
 from deworldsg_ros.graph.nodes import NodeTable
@@ -44,9 +44,6 @@ from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vo
 
 # Gaussians are weighted by their number of pixels; this number gives weight 1.
 PIXELS_PER_WEIGHT = 1000.0
-# A thing that no detector fires at is as probable as one that so many viewpoints have detected:
-# 0.82 in a new graph (of those in rooms that chose nothing, 14 of 15 were things).
-SURE_AS_VIEWS = 2
 SPARE = Vocabulary(("a", "b"), ("on",))
 
 
@@ -128,22 +125,42 @@ class SurfaceMerging:
         self._life_cycle.observe(graph, local, view, node_ids)
         return node_ids
 
-    def add(self, graph: GlobalGraph, things: Sequence[Thing], stamp_ns: int) -> list[int]:
+    def things(self) -> set[int]:
+        """See `Merging.things`."""
+        return set(self._records.nodes_of(self._records.undetected))
+
+    def add(self, graph: GlobalGraph, found: FoundThings) -> None:
         """See `Merging.add`."""
-        records, node_ids, count = self._records, [], len(graph.vocabulary.classes)
-        for points, keyframes in things:
-            classes, moments = np.full(count, 1.0 / count), even_moments(points)
-            node_id = graph.add_node(*moments, classes, stamp_ns, points, confirmed=False)
-            slot = graph.nodes.slot(node_id)
-            graph.nodes.set_surface(slot, points, keyframes)
-            records.add(slot, node_id, classes)
-            beliefs.assume(records.rows[slot], SURE_AS_VIEWS)
-            node_ids.append(node_id)
-        slots = graph.nodes.slots_of(node_ids)
-        records.map.add(slots, records.map.cells_of([thing.points_world for thing in things]))
+        records, nodes, count = self._records, graph.nodes, len(graph.vocabulary.classes)
+        before = records.undetected.tolist()
+        sets = records.map.cells_of([thing.points_world for thing in found.things])
+        owners, on_nodes, _ = records.map.overlaps(sets)
+        slots, classes = [], np.full(count, 1.0 / count)
+        for thing, on in zip(found.things, on_nodes):
+            moments = even_moments(thing.points_world)
+            same = owners[on >= self._config.overlap_threshold].tolist()
+            slot = next((slot for slot in same if slot in before), None)
+            if slot is None:
+                node_id = graph.add_node(*moments, classes, thing.first_ns, confirmed=False)
+                slot = nodes.slot(node_id)
+                records.add(slot, node_id, classes)
+                beliefs.assume(records.rows[slot], beliefs.THING_LOOKS)
+            else:  # more views may show more of it
+                before.remove(slot)
+                records.map.remove(slot)
+                nodes.put(slot, *moments, classes, 1.0, observations=1)
+            nodes.set_surface(slot, thing.points_world, thing.keyframes)
+            nodes.last_seen_ns[slot] = thing.last_ns
+            slots.append(slot)
+        records.map.add(slots, sets)
         records.place(graph, slots)
+        node_ids = records.nodes_of(slots)
+        graph.set_classes(node_ids, np.tile(classes, (len(slots), 1)))
         self._life_cycle.publish_again(graph, node_ids)
-        return node_ids
+        for slot in before:
+            is_searched = nodes.first_seen_ns[slot] >= found.since_ns
+            if is_searched and records.node(slot) not in graph.edits.labels:
+                self._life_cycle.remove(graph, records.node(slot))
 
     def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """See `Merging.hidden`."""

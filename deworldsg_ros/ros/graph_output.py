@@ -23,7 +23,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from deworldsg_ros.graph.embeddings import embeddings_message
 from deworldsg_ros.graph.extent import DEFAULT_UP
-from deworldsg_ros.graph.floor_plan import FloorPlan, Things, floor_plan
+from deworldsg_ros.graph.floor_plan import FloorPlan, FoundThings, floor_plan
 from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.graph.surface import Surface, SurfaceOfSpace, objects_at
@@ -351,6 +351,8 @@ class RoomTopics:
 # things cost at most `ROOMS_SHARE` of a core.
 ROOMS_PERIOD_S, ROOMS_SHARE = 5.0, 0.05
 
+Search = Callable[[], FoundThings]
+
 
 class RoomFinder:
     """Finds the rooms of a graph, and its things, anew when its views or objects have changed.
@@ -358,21 +360,19 @@ class RoomFinder:
     Args:
         node: counts errors.
         found: called in the thread of this, with the graph, the rooms that it had, the new
-            ones with their messages, and what adds the things.
+            ones with their messages, and the things.
     """
 
     def __init__(
         self,
         node: StageNode,
-        found: Callable[
-            [GraphBuilder, RoomMap, RoomMap, list[wire.RoomState], Callable[[], None]], None
-        ],
+        found: Callable[[GraphBuilder, RoomMap, RoomMap, list[wire.RoomState], FoundThings], None],
     ) -> None:
         self._node, self._found = node, found
         self._due_s, self._is_needed = 0.0, False
         # Of what the rooms were found in last.
         self._known: tuple[Any, Any, int] = None, None, -1
-        self._worker: Worker[tuple[GraphBuilder, SeenSpace | None, Any, Things | None]] = Worker(
+        self._worker: Worker[tuple[GraphBuilder, SeenSpace | None, Any, Search]] = Worker(
             "rooms", self._work, size=1, on_overrun=lambda job: None
         )
 
@@ -391,25 +391,21 @@ class RoomFinder:
         if (is_same and snapshot.sequence == self._known[2]) or not self._worker.wait_idle(0.0):
             return
         self._known = space.stamps_ns, space.poses, snapshot.sequence
-        things = None if builder.things is None else copy(builder.things)
-        self._worker.submit((builder, None if is_same else space, snapshot, things))
+        search = builder.search(snapshot.nodes)
+        self._worker.submit((builder, None if is_same else space, snapshot, search))
 
     def close(self) -> None:
         """End the thread."""
         self._worker.stop()
 
-    def _work(self, job: tuple[GraphBuilder, SeenSpace | None, Any, Things | None]) -> None:
-        started_s, (builder, space, snapshot, things) = time.monotonic(), job
+    def _work(self, job: tuple[GraphBuilder, SeenSpace | None, Any, Search]) -> None:
+        started_s, (builder, space, snapshot, search) = time.monotonic(), job
         before = builder.rooms
         with self._node.refusing():
             up = snapshot.up if isinstance(snapshot.up, list) else DEFAULT_UP
             rooms = before if space is None else before.found_in(space, up)
-            standing = [] if things is None else things.find(up, snapshot.nodes)
-            moves = 0 if things is None else things.moves
-            self._found(
-                *(builder, before, rooms, rooms.states(snapshot.nodes)),
-                lambda: builder.add_things(standing, moves),
-            )
+            states, things = rooms.states(snapshot.nodes), search()
+            self._found(builder, before, rooms, states, things)
         now_s = time.monotonic()
         self._due_s = max(self._due_s, now_s + (now_s - started_s) / ROOMS_SHARE)
 

@@ -97,6 +97,10 @@ def things_of(frames: Sequence[LocalGraph]) -> Things:
     return things
 
 
+def found_by(things: Things, *nodes: NodeState) -> list[Thing]:
+    return things.find(UP, nodes).things
+
+
 def node_at(box: object) -> NodeState:
     low, high = np.array(box)
     return make_node(1, "cup", box=box_at(((low + high) / 2).tolist(), (high - low).tolist()))
@@ -112,13 +116,13 @@ def assert_is(thing: Thing, box: object) -> None:
 def test_compact_things_on_a_table_are_found_and_nothing_else():
     frames = walk_round(BOARD, ON_BOARD, LOW_BOX, SHEET, steps=48)
     things = things_of(frames)
-    found = sorted(things.find(UP, []), key=lambda thing: thing.points_world[:, 0].mean())
+    found = sorted(found_by(things), key=lambda thing: thing.points_world[:, 0].mean())
     assert len(found) == 2  # a sheet of 5 mm may be noise
     for thing, box in zip(found, (LOW_BOX, ON_BOARD)):
         assert_is(thing, box)
         assert 40 < len(set(thing.keyframes.tolist())) <= 48
     # What is a node already is not found again; a node around the table hides nothing.
-    (left,) = things.find(UP, [node_at(ON_BOARD), node_at(BOARD)])
+    (left,) = found_by(things, node_at(ON_BOARD), node_at(BOARD))
     assert_is(left, LOW_BOX)
 
 
@@ -128,29 +132,29 @@ def test_compact_things_on_a_table_are_found_and_nothing_else():
     ids=["bare", "wide", "post", "floating"],
 )
 def test_what_is_no_compact_thing_on_a_support_is_not_found(blocks):
-    assert things_of(walk_round(*blocks, steps=36)).find(UP, []) == []
+    assert found_by(things_of(walk_round(*blocks, steps=36))) == []
 
 
 def test_one_viewpoint_finds_nothing_nor_is_found_what_was_carried_away():
-    assert things_of(walk_round(BOARD, ON_BOARD, steps=8, part=0.02)).find(UP, []) == []
+    assert found_by(things_of(walk_round(BOARD, ON_BOARD, steps=8, part=0.02))) == []
     quarter = walk_round(BOARD, ON_BOARD, steps=9, part=0.25)
-    assert len(things_of(quarter).find(UP, [])) == 1
-    assert things_of([*quarter, *walk_round(BOARD, steps=36)]).find(UP, []) == []
+    assert len(found_by(things_of(quarter))) == 1
+    assert found_by(things_of([*quarter, *walk_round(BOARD, steps=36)])) == []
 
 
 def test_things_turn_and_move_with_the_world():
     things = things_of(walk_round(BOARD, ON_BOARD, steps=36))
-    (upright,) = things.find(UP, [])
+    (upright,) = found_by(things)
     stamps_ns = np.array([10**8 * (number + 1) for number in range(36)])
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = horizontal_axes((0.0, -0.9, -0.44)).T, (3.0, 2.0, 1.0)
     before = copy(things)
     things.move(TrailChange(stamps_ns, np.stack([T] * 37), np.stack([T] * 37)))
     assert things.moves == 1 and before.moves == 0
-    (turned,) = things.find(T[:3, :3] @ UP, [])
+    (turned,) = things.find(T[:3, :3] @ UP, []).things
     expected = upright.points_world @ T[:3, :3].T + T[:3, 3]
     np.testing.assert_allclose(turned.points_world.mean(axis=0), expected.mean(axis=0), atol=0.01)
-    (again,) = before.find(UP, [])
+    (again,) = found_by(before)
     np.testing.assert_array_equal(again.points_world, upright.points_world)
 
 
@@ -161,9 +165,9 @@ def test_views_that_are_alike_are_kept_once_and_the_newest_of_many(monkeypatch):
     monkeypatch.setattr("deworldsg_ros.graph.floor_plan.MOST_GLANCES", 20)
     for other in others:
         things.note(other, 1)
-    assert len(things) == 20 and len(things.find(UP, [])) == 1
+    assert len(things) == 20 and len(found_by(things)) == 1
     things.forget()
-    assert len(things) == 0 and things.find(UP, []) == []
+    assert len(things) == 0 and found_by(things) == []
     grid = replace(frame.depth_grid, depth_mm=0 * frame.depth_grid.depth_mm)
     blind = derived(frame, depth_grid=grid)
-    assert things_of([blind]).find(UP, []) == []
+    assert found_by(things_of([blind])) == []
