@@ -197,7 +197,9 @@ def _counted(plan: Float32, corner: Float64, cell_m: float, shape: tuple[int, in
 # views are denser than those of `SeenSpace`.
 MOST_GLANCES = 512
 STEP_M, STEP_TRACE = 0.05, 1.0 + 2.0 * math.cos(math.radians(3.0))
-# Of these, so many tell what can be seen through.
+# Of these, those are searched that are so near to the newest one.
+REACH_M = 15.0
+# And so many tell what can be seen through.
 LOOKS = 60
 # Depth is used from and to here; farther away, a pixel is wider than a cup.
 NEAREST_M, FARTHEST_M = 0.25, 3.5
@@ -245,7 +247,7 @@ class Thing(NamedTuple):
 
 
 class FoundThings(NamedTuple):
-    """The things of the views since a stamp, and how often the views had moved (`Things`)."""
+    """What was found, the stamp from which on all views were searched, and `Things.moves` then."""
 
     things: list[Thing]
     since_ns: int
@@ -289,7 +291,8 @@ class Things:
     def move(self, change: TrailChange) -> None:
         """Move the views with the poses that they were seen from."""
         stamps_ns = np.array([one.stamp_ns for one in self._glances], np.int64)
-        self._poses, self.moves = change.at(stamps_ns) @ self._poses, self.moves + 1
+        self._poses = change.at(stamps_ns) @ self._poses
+        self.is_new, self.moves = True, self.moves + 1
         self._glances = [
             one._replace(T_world_camera=pose) for one, pose in zip(self._glances, self._poses)
         ]
@@ -305,9 +308,12 @@ class Things:
             up: against gravity, world.
             nodes: of the graph; they may be newer than the views.
         """
-        glances, axes = self._glances, horizontal_axes(up)
-        if not glances:
+        if not self._glances:
             return FoundThings([], 0, self.moves)
+        axes, places = horizontal_axes(up), self._poses[:, :3, 3]
+        near = np.abs(places - places[-1]).max(axis=1) < REACH_M
+        glances = [one for one, is_near in zip(self._glances, near) if is_near]
+        left_out = [one.stamp_ns + 1 for one, is_near in zip(self._glances, near) if not is_near]
         cloud = _Cloud(glances, axes, [_ends(node.box, axes) for node in nodes if node.box])
         stamps_ns = np.array([one.stamp_ns for one in glances])
         keyframes = np.array([one.keyframe for one in glances], np.uint16)
@@ -323,7 +329,8 @@ class Things:
             span_ns = int(seen_ns.min()), int(seen_ns.max())
             thing = Thing((points @ axes).astype(np.float32), keyframes[cloud.of[rows]], *span_ns)
             found.append((ends, thing))
-        return FoundThings([thing for _, thing in found], int(stamps_ns.min()), self.moves)
+        since_ns = max(left_out, default=int(stamps_ns.min()))
+        return FoundThings([thing for _, thing in found], since_ns, self.moves)
 
 
 class _Cloud:
@@ -346,7 +353,8 @@ class _Cloud:
         parts = [_shown(*view) for view in self.views]
         self.points = np.concatenate([points for points, _ in parts])
         self.level = np.concatenate([level for _, level in parts])
-        self.of = np.repeat(np.arange(len(parts)), [len(points) for points, _ in parts])
+        counts = [len(points) for points, _ in parts]
+        self.of = np.repeat(np.arange(len(parts), dtype=np.int32), counts)
         self.known = np.zeros(len(self.points), np.bool_)
         for low, high in boxes:
             if (high - low)[:2].max() <= NODE_WIDE_M and (high - low)[2] <= NODE_TALL_M:
@@ -368,8 +376,9 @@ class _Cloud:
         rows = np.flatnonzero(~self.level)
         flat = np.ravel_multi_index(tuple(self.at[rows].T), self.shape)
         layers = np.floor(self.points[rows, 2] / LAYER_TALL_M).astype(np.int64)
-        columns = np.unique(np.stack([flat, layers]), axis=1)[0]
-        tall = np.bincount(columns, minlength=math.prod(self.shape)) >= TALL
+        low, count = int(layers.min(initial=0)), math.prod(self.shape)
+        columns = np.unique((layers - low) * count + flat) % count
+        tall = np.bincount(columns, minlength=count) >= TALL
         tall = cv2.dilate(tall.reshape(self.shape).astype(np.uint8), _BESIDE) > 0
         return np.asarray(tall[tuple(self.at.T)] & ~self.level)
 
@@ -417,7 +426,8 @@ def _supports(cloud: _Cloud) -> list[_Support]:
     rows, heights, flat, layers = rows[above], heights[above], flat[above], layers[above]
     if not len(rows):
         return []
-    areas = np.bincount(np.unique(np.stack([layers, flat]), axis=1)[0]) * THING_CELL_M**2
+    count = math.prod(cloud.shape)
+    areas = np.bincount(np.unique(layers * count + flat) // count) * THING_CELL_M**2
     areas = np.convolve(areas, np.ones(3), "same")
     found: list[_Support] = []
     for layer in np.argsort(-areas, kind="stable"):

@@ -158,9 +158,9 @@ class SurfaceMerging:
         graph.set_classes(node_ids, np.tile(classes, (len(slots), 1)))
         self._life_cycle.publish_again(graph, node_ids)
         for slot in before:
-            is_searched = nodes.first_seen_ns[slot] >= found.since_ns
-            if is_searched and records.node(slot) not in graph.edits.labels:
-                self._life_cycle.remove(graph, records.node(slot))
+            node_id, is_searched = records.node(slot), nodes.first_seen_ns[slot] >= found.since_ns
+            if is_searched and not graph.edits.hides(node_id) and node_id not in graph.edits.labels:
+                self._life_cycle.remove(graph, node_id)
 
     def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """See `Merging.hidden`."""

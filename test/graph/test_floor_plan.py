@@ -158,6 +158,20 @@ def test_things_turn_and_move_with_the_world():
     np.testing.assert_array_equal(again.points_world, upright.points_world)
 
 
+def test_only_the_place_around_the_newest_view_is_searched():
+    away = np.eye(4)
+    away[0, 3] = 40.0
+    here = walk_round(BOARD, ON_BOARD, steps=36)
+    there = [
+        derived(frame, T_world_camera=away @ frame.T_world_camera, stamp_ns=frame.stamp_ns + 10**10)
+        for frame in here
+    ]
+    found = things_of([*here, *there]).find(UP, [])
+    (thing,) = found.things
+    assert thing.points_world[:, 0].min() > 39.0
+    assert here[-1].stamp_ns < found.since_ns <= thing.first_ns
+
+
 def test_views_that_are_alike_are_kept_once_and_the_newest_of_many(monkeypatch):
     frame, *others = walk_round(BOARD, ON_BOARD, steps=36)
     things = things_of([frame, frame, derived(frame, depth_grid=None)])
