@@ -356,10 +356,14 @@ class _Cloud:
         counts = [len(points) for points, _ in parts]
         self.of = np.repeat(np.arange(len(parts), dtype=np.int32), counts)
         self.known = np.zeros(len(self.points), np.bool_)
+        order = self.points[:, 0].argsort()
+        first_axis = self.points[order, 0]
         for low, high in boxes:
             if (high - low)[:2].max() <= NODE_WIDE_M and (high - low)[2] <= NODE_TALL_M:
                 low, high = low - BOX_MARGIN_M, high + BOX_MARGIN_M
-                self.known |= ((self.points >= low) & (self.points <= high)).all(axis=1)
+                rows = order[slice(*first_axis.searchsorted((low[0], high[0])))]
+                near = self.points[rows]
+                self.known[rows] |= ((near >= low) & (near <= high)).all(axis=1)
         plan = self.points[:, :2]
         self.corner = plan.min(axis=0, initial=np.inf) if len(plan) else np.zeros(2)
         self.at = ((plan - self.corner) / THING_CELL_M).astype(np.int64)
