@@ -144,10 +144,11 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stage c: association and fusion (Eq. 5-7)."""
 
     association: Annotated[
-        Literal["paper", "surface"],
+        Literal["paper", "surface", "things"],
         option(
             "association rule: paper = Gaussian and class distance (Eq. 5-6), surface = overlap of "
-            "surfaces"
+            "surfaces, things = surface, and what stands on tables and shelves is an object "
+            "without a name where no detector fires"
         ),
     ] = "surface"
     hellinger_threshold: Annotated[

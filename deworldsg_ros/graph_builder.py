@@ -6,12 +6,15 @@ The graph node and the in-process pipeline both use this, so that they give the 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph.edits import GraphEdit, NameRoom
+from deworldsg_ros.graph.floor_plan import FoundThings, Things
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeBoxes, hidden_node
 from deworldsg_ros.graph.pairs import frame_votes
@@ -54,6 +57,7 @@ class GraphBuilder:
         trail: the poses of the frames.
         poses_frame: world frame of the local graphs and corrections to come.
         rooms: the rooms of that space, as of the last `find_rooms` or `set_rooms`.
+        things: views for `find_things`; None = not configured.
         prior: of class pairs.
         refused: what was left out of the newest frame, in words, by reason.
     """
@@ -75,7 +79,7 @@ class GraphBuilder:
         self.graph = graph
         self.merging = build_merging(config.merging, output.min_existence)
         # The paper takes poses as they are, and has no boxes.
-        self._drift = Drift() if config.merging.association == "surface" else None
+        self._drift = Drift() if config.merging.association != "paper" else None
         self._edges = EdgeBeliefs(config, graph, prior)
         self._boxes = NodeBoxes(graph.nodes, lambda slots: self.merging.shown(graph.nodes, slots))
         self._publication = Publication(
@@ -89,6 +93,7 @@ class GraphBuilder:
         )
         self.frames, self.space, self.trail = FrameMemory(), SeenSpace(), Trail()
         self.rooms = RoomMap()
+        self.things = Things() if config.merging.association == "things" else None
         # How keyframes have moved, and the nodes that have still to follow.
         self._T_new_old, self._due = np.eye(4)[None], list[int]()
         self._newest_ns: int | None = None
@@ -185,6 +190,8 @@ class GraphBuilder:
         if self.trail.note(local.stamp_ns, T_given, local.T_world_camera):
             self.settle()  # by the old numbers
             self.graph.nodes.halve_keyframes()
+            if self.things is not None:
+                self.things.forget()
         self.graph.nodes.keyframe = self.trail.keyframe
         logits = local.relations.logits
         weights = softmax_weights(logits) if logits.size else None
@@ -199,6 +206,8 @@ class GraphBuilder:
             self._boxes.observe(local, node_ids, self.up.estimate)
         self.frames.note(self.graph, local, node_ids, votes)
         self.space.note(local)
+        if self.things is not None:
+            self.things.note(local, self.trail.keyframe)
         self._newest_ns = local.stamp_ns
         self._publication.note_frame(local.stamp_ns, node_ids)
         return node_ids
@@ -242,10 +251,32 @@ class GraphBuilder:
         return self._drift is not None and len(self.space) > 0
 
     def find_rooms(self) -> None:
-        """Find the rooms of the space that was seen so far; takes a second or two."""
+        """Find the things and the rooms of what was seen so far; takes some seconds."""
+        self.find_things()
         if self.has_rooms:
             rooms = self.rooms.found_in(self.space, self.up.up_world().tolist())
             self.set_rooms(rooms, rooms.states(self._publication.full().nodes))
+
+    def find_things(self) -> None:
+        """Find things that no detector fires at, if configured; takes two seconds or more."""
+        if self.things is not None and self.things.is_new:
+            self.add_things(self.search(self.full().nodes)())
+
+    def search(self, nodes: Sequence[wire.NodeState]) -> Callable[[], FoundThings]:
+        """What finds the things, in any thread, besides the nodes that were detected."""
+        if self.things is None or not self.things.is_new:
+            return lambda: FoundThings([], 0, -1)
+        self.things.is_new = False
+        views, up, things = copy(self.things), self.up.up_world().tolist(), self.merging.things()
+        return lambda: views.find(up, (node for node in nodes if node.id not in things))
+
+    def add_things(self, found: FoundThings) -> None:
+        """Make things nodes without a name, unless the views have moved since they were found.
+
+        Those of before that are not found again go. The next `update` has the changes.
+        """
+        if self.things is not None and self.things.moves == found.moves:
+            self.merging.add(self.graph, found)
 
     def set_rooms(self, rooms: RoomMap, states: list[wire.RoomState]) -> None:
         """Set the rooms, and their messages; the next `update` has them if they are others."""
@@ -295,6 +326,8 @@ class GraphBuilder:
         if self._drift is not None:
             self._drift = Drift()
         self.space.move(change)
+        if self.things is not None:
+            self.things.move(change)
         nodes, self._T_new_old = self.graph.nodes, change.T_new_old
         slots = nodes.slots
         counts = np.maximum(nodes.surface_counts[slots, None], 1)
@@ -369,7 +402,7 @@ def warm_up(config: Config, *parts: str) -> None:
     for part in parts or KERNEL_PARTS:
         if part == "merging":
             build_merging(config.merging, config.output.min_existence).warm_up()
-        elif part == "drift" and config.merging.association == "surface":
+        elif part == "drift" and config.merging.association != "paper":
             Drift().warm_up()
         elif part == "pairs":
             beliefs.warm_up(config)
@@ -377,4 +410,4 @@ def warm_up(config: Config, *parts: str) -> None:
 
 def graph_settings(merging: MergingConfig) -> dict[str, Any]:
     """Settings of `GlobalGraph` by name."""
-    return {"even_gaussians": merging.association == "surface"}
+    return {"even_gaussians": merging.association != "paper"}

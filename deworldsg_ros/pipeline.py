@@ -275,13 +275,14 @@ class Pipeline:
             self.returning.note_evidence(evidence)
 
     def graph(self) -> wire.SceneGraphMessage:
-        """The whole graph so far, with surface points.
+        """The whole graph so far, with surface points, and things if they are configured.
 
         Raises:
             RefusedInput: ``no_frames`` before the first frame.
         """
         if self.builder is None:
             raise RefusedInput("no_frames", "there is no graph: no frame was processed")
+        self.builder.find_things()
         return self.builder.full()
 
 

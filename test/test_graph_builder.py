@@ -11,12 +11,14 @@ from support.merging import VOCABULARY as VOCABULARY_OF_FRAMES
 from support.merging import local_graph
 from support.reference_updates import diff
 from support.room_nodes import DINNER, VOCABULARY, change, room
+from support.spaces import BOARD, ON_BOARD, walk_round
 
-from deworldsg_ros.config import Config, OutputConfig, RelationsConfig
+from deworldsg_ros.config import Config, InputsConfig, MergingConfig, OutputConfig, RelationsConfig
+from deworldsg_ros.graph.edits import SetLabel
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import RelationEvidence, Vocabulary
+from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary, derived
 from deworldsg_ros.wire.follow import GraphReplica
 
 RULES = {
@@ -144,3 +146,113 @@ def test_a_clock_that_was_set_back_does_not_end_the_graph() -> None:
     assert seen_at(2 * 10**9)
     builder.update()
     assert builder.snapshot().stamp.sec == 2
+
+
+def frames_with(frames: list[LocalGraph], label: str, box: object) -> list[LocalGraph]:
+    """The frames with a detection: points on the top and the sides of a box (2, 3)."""
+    low, high = np.array(box)
+    points = np.random.default_rng(0).uniform(low, high, (1500, 3))
+    points[:500, 2] = high[2]
+    points[500:1000, 0] = np.where(points[500:1000, 1] > low[1:2].mean(), low[0], high[0])
+    points[1000:, 1] = np.where(points[1000:, 0] > (low[0] + high[0]) / 2, low[1], high[1])
+    classes = np.full((1, 4), 0.04)
+    classes[0, VOCABULARY_OF_FRAMES.classes.index(label)] = 0.88
+    seen = points.mean(axis=0)[None], np.cov(points.T)[None], classes
+    surface = (points.astype(np.float32),)
+    return [
+        local_graph(
+            frame.stamp_ns,
+            *seen,
+            points=surface,
+            depth_grid=frame.depth_grid,
+            T_world_camera=frame.T_world_camera,
+        )
+        for frame in frames
+    ]
+
+
+def test_what_no_detector_fires_at_is_a_node_without_a_name(tmp_path: Path) -> None:
+    frames = frames_with(walk_round(BOARD, ON_BOARD, steps=36), "table", BOARD)
+    nodes = {}
+    for rule in ("surface", "things"):
+        config = Config(merging=MergingConfig(association=rule), inputs=InputsConfig(world_up="z"))
+        builder = GraphBuilder(config, VOCABULARY_OF_FRAMES, "world")
+        for frame in frames:
+            builder.integrate(frame)
+        builder.update()
+        builder.find_things()
+        nodes[rule] = builder.full().nodes
+    table, thing = nodes["things"]
+    assert nodes["surface"] == [table] and table.label == "table"
+    assert (thing.label, thing.named, thing.observations) == ("object", False, 1)
+    assert 0.7 < thing.existence < 0.95 and thing.classes[0].probability < 0.5
+    low, high = np.array(ON_BOARD)
+    np.testing.assert_allclose(thing.box.center_m, (low + high) / 2, atol=0.02)
+    np.testing.assert_allclose(thing.box.size_m, high - low, atol=0.03)
+    (edge,) = builder.full().edges
+    assert (edge.subject, edge.object, edge.predicate) == (thing.id, table.id, "on")
+    assert [node.id for node in builder.update().nodes] == [thing.id]
+    # It is found once, and stays while nothing is seen through it.
+    again = [derived(frame, stamp_ns=frame.stamp_ns + 10**10) for frame in frames]
+    for frame in again:
+        builder.integrate(frame)
+    builder.find_things()
+    assert [node.id for node in builder.full().nodes] == [table.id, thing.id]
+    path = tmp_path / "room.map"
+    write_map(builder, path)
+    kept = read_map(config, path)
+    assert kept.full().nodes == builder.full().nodes
+    # A detector that fires at it names it.
+    for frame in frames_with(again[:18], "cup", ON_BOARD):
+        builder.integrate(derived(frame, stamp_ns=frame.stamp_ns + 10**10))
+    named = {node.id: node.label for node in builder.full().nodes}
+    assert named == {table.id: "table", thing.id: "cup"}
+    # Carried away.
+    for frame in walk_round(BOARD, steps=36):
+        kept.integrate(derived(frame, stamp_ns=frame.stamp_ns + 2 * 10**10))
+    assert [node.id for node in kept.full().nodes] == [table.id]
+
+
+def test_a_thing_that_its_own_views_do_not_show_any_more_goes() -> None:
+    config = Config(merging=MergingConfig(association="things"), inputs=InputsConfig(world_up="z"))
+    builder = GraphBuilder(config, VOCABULARY_OF_FRAMES, "world")
+    for frame in walk_round(BOARD, ON_BOARD, steps=36):
+        builder.integrate(frame)
+    found = builder.things.find((0.0, 0.0, 1.0), [])
+    assert (found.since_ns, found.moves) == (10**8, 0)
+    (thing,) = found.things
+    assert found.since_ns <= thing.first_ns < thing.last_ns <= 36 * 10**8
+    ghost = thing._replace(points_world=thing.points_world - np.float32((0.5, 0.1, 0.0)))
+    builder.add_things(found._replace(things=[thing, ghost]))
+    assert [node.id for node in builder.full().nodes] == [1, 2]
+    # These views are newer than the ghost: they cannot tell.
+    builder.add_things(found._replace(things=[thing], since_ns=thing.first_ns + 1))
+    assert [node.id for node in builder.full().nodes] == [1, 2]
+    # Of a thing that is found again, the newest surface counts.
+    more = thing._replace(points_world=thing.points_world + np.float32((0.03, 0.0, 0.0)))
+    before = builder.full().nodes[0].mean_m[0]
+    builder.add_things(found._replace(things=[more]))
+    (node,) = builder.full().nodes
+    assert node.id == 1 and node.mean_m[0] - before == pytest.approx(0.03, abs=1e-3)
+    builder.edit(SetLabel(1, "jar"))
+    builder.add_things(found._replace(things=[]))
+    assert [node.label for node in builder.full().nodes] == ["jar"]
+
+
+def test_things_follow_a_corrected_trajectory() -> None:
+    config = Config(merging=MergingConfig(association="things"), inputs=InputsConfig(world_up="z"))
+    builder = GraphBuilder(config, VOCABULARY_OF_FRAMES, "world")
+    for frame in walk_round(BOARD, ON_BOARD, steps=36):
+        builder.integrate(frame)
+    builder.find_things()
+    (before,) = builder.full().nodes
+    found = builder.things.find((0.0, 0.0, 1.0), [])
+    T = np.eye(4)
+    T[:3, 3] = (1.0, 0.5, 0.0)
+    assert builder.apply_correction(T, 0) == 1
+    (after,) = builder.full().nodes
+    np.testing.assert_allclose(np.subtract(after.mean_m, before.mean_m), T[:3, 3], atol=2e-3)
+    builder.find_things()
+    assert len(builder.full().nodes) == 1
+    builder.add_things(found)  # found where they were before the correction
+    assert len(builder.full().nodes) == 1

@@ -12,6 +12,7 @@ from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.floor_plan import FoundThings
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.graph.nodes import NodeTable
@@ -208,6 +209,14 @@ class PaperMerging:
         graph.remember_frame(local.stamp_ns, node_ids)
         graph.add_relations(local, node_ids)
         return node_ids
+
+    def things(self) -> set[int]:
+        """See `Merging.things`."""
+        return set()
+
+    def add(self, graph: GlobalGraph, found: FoundThings) -> None:
+        """See `Merging.add`."""
+        raise AssertionError("the paper's rule has no nodes that were never detected")
 
     def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """The deleted nodes; all others are published."""

@@ -215,6 +215,13 @@ class NodeRecords:
         return np.flatnonzero(self.rows["node_id"])
 
     @property
+    def undetected(self) -> Int64:
+        """The slots of things that nothing has detected; see `beliefs.THING_LOOKS`."""
+        slots = self.slots
+        views, looks = self.rows["views"][slots], self.rows["looks"][slots]
+        return np.asarray(slots[(views == 0) & (looks == beliefs.THING_LOOKS)])
+
+    @property
     def ids(self) -> list[int]:
         """The nodes with a record."""
         node_ids: list[int] = self.rows["node_id"][self.slots].tolist()
@@ -525,7 +532,7 @@ def _rebuild(records: NodeRecords, graph: GlobalGraph, slots: Int64) -> None:
     _name(records, graph, slots)
     records.map.add(slots, records.map.cells_of([nodes.surface(slot) for slot in slots]))
     for slot, observations in zip(slots, nodes.observations[slots].tolist()):
-        beliefs.assume(records.rows[slot], observations)
+        beliefs.assume(records.rows[slot], max(observations, 3))
 
 
 def _name(records: NodeRecords, graph: GlobalGraph, slots: Int64) -> None:

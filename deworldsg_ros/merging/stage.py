@@ -8,6 +8,7 @@ from typing import Protocol
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.floor_plan import FoundThings
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.editing import EditReply
@@ -43,6 +44,18 @@ class Merging(Protocol):
 
         Raises:
             RefusedInput: as `GlobalGraph.admit`.
+        """
+        ...
+
+    def things(self) -> set[int]:
+        """The nodes that were never detected: things that `add` has added."""
+        ...
+
+    def add(self, graph: GlobalGraph, found: FoundThings) -> None:
+        """Make each thing that no detector fires at a node without a name.
+
+        A thing of before keeps its node. It goes if its views were searched again, and it was not
+        found. The paper's rule has no such nodes.
         """
         ...
 

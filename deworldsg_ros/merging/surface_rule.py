@@ -14,9 +14,12 @@ import numpy as np
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.extent import even_moments
+from deworldsg_ros.graph.floor_plan import FoundThings
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeBoxes, NodeStates
 from deworldsg_ros.graph.nodes import NodeTable
+from deworldsg_ros.merging import beliefs
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.editing import (
     EditReply,
@@ -121,6 +124,43 @@ class SurfaceMerging:
         node_ids = self._merge_parts(graph, local, matches, node_ids, view.slots)
         self._life_cycle.observe(graph, local, view, node_ids)
         return node_ids
+
+    def things(self) -> set[int]:
+        """See `Merging.things`."""
+        return set(self._records.nodes_of(self._records.undetected))
+
+    def add(self, graph: GlobalGraph, found: FoundThings) -> None:
+        """See `Merging.add`."""
+        records, nodes, count = self._records, graph.nodes, len(graph.vocabulary.classes)
+        before = records.undetected.tolist()
+        sets = records.map.cells_of([thing.points_world for thing in found.things])
+        owners, on_nodes, _ = records.map.overlaps(sets)
+        slots, classes = [], np.full(count, 1.0 / count)
+        for thing, on in zip(found.things, on_nodes):
+            moments = even_moments(thing.points_world)
+            same = owners[on >= self._config.overlap_threshold].tolist()
+            slot = next((slot for slot in same if slot in before), None)
+            if slot is None:
+                node_id = graph.add_node(*moments, classes, thing.first_ns, confirmed=False)
+                slot = nodes.slot(node_id)
+                records.add(slot, node_id, classes)
+                beliefs.assume(records.rows[slot], beliefs.THING_LOOKS)
+            else:  # more views may show more of it
+                before.remove(slot)
+                records.map.remove(slot)
+                nodes.put(slot, *moments, classes, 1.0, observations=1)
+            nodes.set_surface(slot, thing.points_world, thing.keyframes)
+            nodes.last_seen_ns[slot] = thing.last_ns
+            slots.append(slot)
+        records.map.add(slots, sets)
+        records.place(graph, slots)
+        node_ids = records.nodes_of(slots)
+        graph.set_classes(node_ids, np.tile(classes, (len(slots), 1)))
+        self._life_cycle.publish_again(graph, node_ids)
+        for slot in before:
+            node_id, is_searched = records.node(slot), nodes.first_seen_ns[slot] >= found.since_ns
+            if is_searched and not graph.edits.hides(node_id) and node_id not in graph.edits.labels:
+                self._life_cycle.remove(graph, node_id)
 
     def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """See `Merging.hidden`."""

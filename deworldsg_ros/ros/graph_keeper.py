@@ -15,6 +15,7 @@ from deworldsg_ros.base.files import write_atomically
 from deworldsg_ros.base.words import counted
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph.embeddings import embeddings_path, write_embeddings
+from deworldsg_ros.graph.floor_plan import FoundThings
 from deworldsg_ros.graph.provenance import path_beside, space_path, write_seen, write_space
 from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
@@ -507,10 +508,12 @@ class GraphKeeper:
         before: RoomMap,
         rooms: RoomMap,
         states: list[wire.RoomState],
+        things: FoundThings,
     ) -> None:
-        """Take rooms that were found, unless the graph or a name is another one now."""
+        """Take rooms and things that were found, unless the graph or a name is another one now."""
         if builder is self._builder and builder.rooms is before:
             builder.set_rooms(rooms, states)
+            builder.add_things(things)
             self._times.changed(self._running_s, time.monotonic(), can_wait=True)
 
     def _correct(self, correct: Correct) -> None:

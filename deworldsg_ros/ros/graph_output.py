@@ -23,7 +23,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from deworldsg_ros.graph.embeddings import embeddings_message
 from deworldsg_ros.graph.extent import DEFAULT_UP
-from deworldsg_ros.graph.floor_plan import FloorPlan, floor_plan
+from deworldsg_ros.graph.floor_plan import FloorPlan, FoundThings, floor_plan
 from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.graph.rooms import RoomMap
 from deworldsg_ros.graph.surface import Surface, SurfaceOfSpace, objects_at
@@ -345,32 +345,34 @@ class RoomTopics:
         self._due_s = max(self._due_s, now_s + (now_s - started_s) / MAX_SHARE)
 
 
-# --- Rooms, found in the background.
+# --- Rooms, and things that no detector fires at, found in the background.
 
-# A change of the views or of the objects is in the rooms after this time, or later: they cost at
-# most `ROOMS_SHARE` of a core.
+# A change of the views or of the objects is in the rooms after this time, or later: they and the
+# things cost at most `ROOMS_SHARE` of a core.
 ROOMS_PERIOD_S, ROOMS_SHARE = 5.0, 0.05
+
+Search = Callable[[], FoundThings]
 
 
 class RoomFinder:
-    """Finds the rooms of a graph anew when its views or its objects have changed.
+    """Finds the rooms of a graph, and its things, anew when its views or objects have changed.
 
     Args:
         node: counts errors.
-        found: called in the thread of this, with the graph, the rooms that it had, and the new
-            ones with their messages.
+        found: called in the thread of this, with the graph, the rooms that it had, the new
+            ones with their messages, and the things.
     """
 
     def __init__(
         self,
         node: StageNode,
-        found: Callable[[GraphBuilder, RoomMap, RoomMap, list[wire.RoomState]], None],
+        found: Callable[[GraphBuilder, RoomMap, RoomMap, list[wire.RoomState], FoundThings], None],
     ) -> None:
         self._node, self._found = node, found
         self._due_s, self._is_needed = 0.0, False
         # Of what the rooms were found in last.
         self._known: tuple[Any, Any, int] = None, None, -1
-        self._worker: Worker[tuple[GraphBuilder, SeenSpace | None, Any]] = Worker(
+        self._worker: Worker[tuple[GraphBuilder, SeenSpace | None, Any, Search]] = Worker(
             "rooms", self._work, size=1, on_overrun=lambda job: None
         )
 
@@ -389,19 +391,21 @@ class RoomFinder:
         if (is_same and snapshot.sequence == self._known[2]) or not self._worker.wait_idle(0.0):
             return
         self._known = space.stamps_ns, space.poses, snapshot.sequence
-        self._worker.submit((builder, None if is_same else space, snapshot))
+        search = builder.search(snapshot.nodes)
+        self._worker.submit((builder, None if is_same else space, snapshot, search))
 
     def close(self) -> None:
         """End the thread."""
         self._worker.stop()
 
-    def _work(self, job: tuple[GraphBuilder, SeenSpace | None, Any]) -> None:
-        started_s, (builder, space, snapshot) = time.monotonic(), job
+    def _work(self, job: tuple[GraphBuilder, SeenSpace | None, Any, Search]) -> None:
+        started_s, (builder, space, snapshot, search) = time.monotonic(), job
         before = builder.rooms
         with self._node.refusing():
             up = snapshot.up if isinstance(snapshot.up, list) else DEFAULT_UP
             rooms = before if space is None else before.found_in(space, up)
-            self._found(builder, before, rooms, rooms.states(snapshot.nodes))
+            states, things = rooms.states(snapshot.nodes), search()
+            self._found(builder, before, rooms, states, things)
         now_s = time.monotonic()
         self._due_s = max(self._due_s, now_s + (now_s - started_s) / ROOMS_SHARE)
 

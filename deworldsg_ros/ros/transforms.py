@@ -185,7 +185,7 @@ class Corrections:
         kinds = [Path] if MapGraph is None else [Path, MapGraph]
         sources = [source(TRAJECTORY_TOPIC, kind) for kind in kinds]
         node.listen("trajectory", sources, self._follow, "auto", depth=1)
-        if TFMessage is not None and node.parameters.merging.association == "surface":
+        if TFMessage is not None and node.parameters.merging.association != "paper":
             node.create_subscription(
                 TFMessage, "/tf", node.guarded(self._transforms), reliable(POSE_DEPTH)
             )

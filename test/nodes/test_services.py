@@ -20,7 +20,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.nodes_bench import LIMIT_S, Bench
 from support.reference_updates import diff
-from support.spaces import seen_room
+from support.spaces import BOARD, ON_BOARD, seen_room, walk_round
 from support.surfaces import CUP, HERE, TABLE, slab, view
 
 from deworldsg_ros.cli.app import app
@@ -28,6 +28,7 @@ from deworldsg_ros.client import ClientError, SceneGraphClient
 from deworldsg_ros.client import Robot as RobotSize
 from deworldsg_ros.client.mcp_server import EditTools, GraphTools
 from deworldsg_ros.client.questions import ask
+from deworldsg_ros.graph.floor_plan import Things
 from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.graph_builder import GraphBuilder
@@ -430,12 +431,21 @@ def test_the_room_is_published_while_somebody_listens(robot):
     robot.expect(lambda: len(plans) > count, "the plan of a low robot")
 
 
+def things_of_table() -> Things:
+    things = Things()
+    for frame in walk_round(BOARD, ON_BOARD, steps=36):
+        things.note(frame, 1)
+    return things
+
+
 def test_rooms_are_found_in_the_background_named_and_saved(robot, client, tmp_path, monkeypatch):
     monkeypatch.setattr(graph_output, "ROOMS_PERIOD_S", 0.2)
     builder = robot.node.graph.builder
     robot.node.graph.submit(lambda: setattr(builder, "space", seen_room()))
+    robot.node.graph.submit(lambda: setattr(builder, "things", things_of_table()))
     robot.see()
     robot.expect(lambda: client.graph.rooms, "the room")
+    robot.expect(lambda: "object" in {item.label for item in client.graph}, "what stands there")
     (room,) = client.graph.rooms
     assert 8.0 < room.area_m2 < 12.5
     answer = robot.ask(client.name_room, room.id, "study")
