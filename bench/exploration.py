@@ -533,22 +533,25 @@ def main() -> None:
     parser.add_argument("--plot", type=Path, help="write a picture of each home there")
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.homes)
-    found = measure(seeds, tuple(options.methods))
+    found: dict[str, list[Run]] = {method: [] for method in options.methods}
+    for seed in seeds:
+        runs = measure(range(seed, seed + 1), tuple(options.methods))
+        for method in found:
+            found[method] += runs[method]
+        if options.plot is not None:
+            plot(seed, {method: runs[method][0] for method in runs}, options.plot)
     print("| method | found at its end | 90 % reached | path | turned |\n|---|---|---|---|---|")
-    for method, runs in found.items():
-        shares = [100 * run.found for run in runs]
-        reached = sum(run.found >= WANTED for run in runs)
+    for method, done in found.items():
+        shares = [100 * run.found for run in done]
+        reached = sum(run.found >= WANTED for run in done)
         print(
             f"| {method} | {np.mean(shares):.0f} % ({min(shares):.0f}–{max(shares):.0f}) | "
-            f"{reached} of {len(runs)} | {np.mean([run.way_m for run in runs]):.1f} m | "
-            f"{np.mean([math.degrees(run.turned_rad) for run in runs]):.0f}° |"
+            f"{reached} of {len(done)} | {np.mean([run.way_m for run in done]):.1f} m | "
+            f"{np.mean([math.degrees(run.turned_rad) for run in done]):.0f}° |"
         )
     for theirs in options.methods:
         if theirs != OURS and OURS in found:
             print_compared(seeds, found[OURS], found[theirs], theirs)
-    if options.plot is not None:
-        for number, seed in enumerate(seeds):
-            plot(seed, {method: runs[number] for method, runs in found.items()}, options.plot)
 
 
 if __name__ == "__main__":
