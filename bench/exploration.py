@@ -49,7 +49,7 @@ from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.wire import messages as wire
 
 # Constants were chosen on homes 0 to 11. Reported before: 100 to 111, 200 to 211, 300 to 304.
-FIRST, HOMES = 312, 6
+FIRST, HOMES = 312, 12
 ROBOT = Robot(radius_m=0.25, height_m=1.3)
 CAMERA_M, DOWN_RAD, FAR_M = 1.2, 0.3, 4.5
 # A frame after so much way, or turn.

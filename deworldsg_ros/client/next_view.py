@@ -57,8 +57,6 @@ SECTORS = 12
 NODE_RANGE_M = 4.0
 # Standing still and turning cost as much as so much of the way: radian, and each view.
 TURN_M, VIEW_M = 0.05, 0.1
-# To leave the way for a place costs as much as so much more of it; what is nearer is here.
-DETOUR_M, HERE_M = 1.0, 0.2
 # For people, in place of a pose.
 NOTHING = "nothing is worth a look: no space, name, object or relation would be told better"
 # A robot may stand so far beside the known cells.
@@ -356,18 +354,9 @@ def next_view(
     way_m, turns = (
         (0.0, np.zeros(YAWS)) if here is None else (views.way_m, _turns(cells, has_views))
     )
-    place = int((told / cost_m(way_m)).argmax())
+    place = int((told / (VIEW_M + way_m)).argmax())
     yaw = int((gains[place] / (VIEW_M + TURN_M * turns)).argmax())
     return _answer(graph, cells, views, looks, items, (place, yaw), here)
-
-
-def cost_m(way_m: Any) -> Float64:
-    """What it costs to go to places, by the way to each: metres.
-
-    A place nearby is a detour: the robot comes back to its way. Otherwise small gains that are
-    beside it always come before a room that is far.
-    """
-    return np.asarray(VIEW_M + way_m + DETOUR_M * (np.asarray(way_m) > HERE_M))
 
 
 def _turns(cells: SeenCells, has_views: bool) -> Float64:

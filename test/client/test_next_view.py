@@ -264,24 +264,6 @@ def test_a_message_alone_tells_of_names_existence_and_relations_not_of_space():
     assert found.reason == "to see whether there is a lamp"
 
 
-def test_a_small_gain_beside_the_way_is_a_detour_and_one_where_it_stands_is_not():
-    outline = [[x, y, 0.0] for x, y in ((-9, -1.5), (9, -1.5), (9, 1.5), (-9, 1.5))]
-    room = wire.RoomState(1, "room", [], 0, outline, 54.0, [], [])
-
-    def cups(first, x, count):
-        return [
-            thing(first + k, "cup", (x + 0.3 * k, -1.2, 0.85), (0.1, 0.1, 0.1), sure=0.5)
-            for k in range(count)
-        ]
-
-    def view(x):  # of one cup at x, and three that are 7 m away on the other side
-        graph = seen_graph(*cups(1, x, 1), *cups(50, -7.5, 3), rooms=[room])
-        return graph.next_view(robot=SMALL, start=(0.0, 0.0, 0.0))
-
-    assert set(view(4.2).objects) == {50, 51, 52}  # it could see the one 0.5 m from here
-    assert view(3.0).objects == (1,) and view(3.0).path_m == 0.0  # it sees it from here
-
-
 def replace_name(node, sure):
     import msgspec
 
