@@ -230,6 +230,8 @@ def cast(origin, rays, boxes, shell):
                 t0 = (-half[axis] - start[axis]) / step[axis]
                 t1 = (half[axis] - start[axis]) / step[axis]
                 near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
+                if near >= far:
+                    break
             if near < far and near < best:
                 best, hits[i] = near, k
         depths[i] = best
