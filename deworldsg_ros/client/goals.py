@@ -284,7 +284,7 @@ def _seen_free(
     space: SeenSpace | None, target: SceneObject, spots: Float64, floor: float, robot: Robot
 ) -> list[float | None]:
     """Share of the robot's volume at each spot that was seen as free; -1 = something is there."""
-    if space is None or not len(space):
+    if space is None or not len(space) or not len(spots):
         return [None] * len(spots)
     disc = np.concatenate([np.zeros((1, 2)), robot.radius_m * _rays()[::9]])
     lowest_m = min(LOWEST_M, robot.height_m / 2.0)

@@ -91,6 +91,10 @@ def test_a_goal_is_not_behind_a_wall_that_was_seen():
 def test_no_free_side(corner, distance, words):
     with pytest.raises(ClientError, match=words):
         corner.goal_near("cup", distance)
+    space = SeenSpace()
+    add_view(space, looking((0.0, -2.0, 1.2), 90.0), 10**9)
+    with pytest.raises(ClientError, match=words):
+        corner.goal_near("cup", distance, space=space)
 
 
 def test_a_small_robot_goes_where_a_large_one_does_not(corner):

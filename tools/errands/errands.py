@@ -14,7 +14,9 @@ import math
 import multiprocessing
 import sys
 import time
+import traceback
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -47,7 +49,7 @@ SAME_M = 0.4
 MOST_DETOUR, SPARE_M = 2.0, 1.5
 STAGES = (
     "not in the graph", "wrong name", "question", "unreachable", "path too long", "not in view",
-    "claimed",
+    "claimed", "error",
 )  # fmt: skip
 US, LABEL = "this one", "the nearest with the name"
 
@@ -331,15 +333,15 @@ def run_home(
     tasks = [*standing_tasks(home, errands.rng), *absent_tasks(home, errands.rng)]
     for task in filter(errands.is_possible, tasks[:most]):
         rivals = (*errands.others, LABEL) if others else ()
-        found += [errands.run_other(method, task) for method in rivals]
-        found.append(errands.run(task))
+        found += [_tried(errands.run_other, method, task, seed) for method in rivals]
+        found.append(_tried(lambda _, task: errands.run(task), US, task, seed))
         _tell(found[-1 - len(rivals) :])
     if most is None or most > len(tasks):
         moved = move_things(home, errands.rng)
         robot.camera.move()
         moved = moved[: None if most is None else most - len(tasks)]
         for task in filter(errands.is_possible, moved):
-            found.append(errands.run(task))
+            found.append(_tried(lambda _, task: errands.run(task), US, task, seed))
             _tell(found[-1:])
     errands.close()
     print(
@@ -349,6 +351,15 @@ def run_home(
         flush=True,
     )
     return found
+
+
+def _tried(run: Callable[[str, Task], Outcome], method: str, task: Task, seed: int) -> Outcome:
+    """The outcome of an errand; an error is a failure, and the other errands go on."""
+    try:
+        return run(method, task)
+    except Exception as error:
+        traceback.print_exc()
+        return Outcome(method, task.kind, task.words, seed, "error", said=repr(error))
 
 
 def _tell(outcomes: list[Outcome]) -> None:
