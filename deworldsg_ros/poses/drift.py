@@ -89,6 +89,10 @@ class SurfelMap:
         self.seen, is_found, T_fitted, hessian = fitted
         return _as_held(T_world_camera, T_fitted, hessian) if is_found else None
 
+    def misfit(self, T_world_camera: Float64) -> float:
+        """How badly the frame of the last `register` fits the map at a pose; 0 = exactly."""
+        return float(_system(self.rows, self.seen, T_world_camera, self._view, REACHES_M[-1])[3])
+
     def add(self, T_world_camera: Float64) -> None:
         """Fuse the frame of the last `register`."""
         new = self._view[4].size // 4
@@ -219,10 +223,13 @@ def _turned(T: Float64, x: float, y: float, z: float) -> tuple[float, float, flo
 @kernel
 def _system(
     rows: Float64, seen: Int64, T: Float64, view: _View, reach_m: float
-) -> tuple[Float64, Float64, int]:
-    """Damped normal equations (6, 6) and (6,) of a point-to-plane step; the number of matches."""
+) -> tuple[Float64, Float64, int, float]:
+    """Damped normal equations (6, 6) and (6,) of a point-to-plane step; the number of matches.
+
+    Last, the mean robust cost (Cauchy) of the surfels in view: one beyond reach costs as at reach.
+    """
     hessian, gradient = np.zeros((6, 6), np.float64), np.zeros(6, np.float64)
-    jacobian, matches = np.empty(6, np.float64), 0
+    jacobian, matches, cost, weights = np.empty(6, np.float64), 0, 0.0, 1e-9
     inverse = np.zeros((3, 4), np.float64)
     for i in range(3):
         for j in range(3):
@@ -237,10 +244,13 @@ def _system(
         x, y, z = _turned(T, x, y, z)
         a, b, c = surfel[0] - T[0, 3] - x, surfel[1] - T[1, 3] - y, surfel[2] - T[2, 3] - z
         distance = a * surfel[3] + b * surfel[4] + c * surfel[5]
-        if abs(distance) > reach_m or a * a + b * b + c * c > 4 * reach_m**2:
-            continue
         noise_m = NOISE_M + NOISE_PER_M * measured**2
         outlier_m = OUTLIER_NOISE * noise_m * reach_m / REACHES_M[-1]
+        weights += min(surfel[6], TRUSTED)
+        if abs(distance) > reach_m or a * a + b * b + c * c > 4 * reach_m**2:
+            cost += min(surfel[6], TRUSTED) * math.log(1 + (reach_m / outlier_m) ** 2)
+            continue
+        cost += min(surfel[6], TRUSTED) * math.log(1 + (distance / outlier_m) ** 2)
         weight = min(surfel[6], TRUSTED) / (1 + (distance / outlier_m) ** 2) / noise_m**2
         jacobian[0] = y * surfel[5] - z * surfel[4]
         jacobian[1] = z * surfel[3] - x * surfel[5]
@@ -258,7 +268,7 @@ def _system(
     mean = (hessian[3, 3] + hessian[4, 4] + hessian[5, 5]) / 3
     for i in range(6):
         hessian[i, i] += DAMPING * mean * (RADIAN_M**2 if i < 3 else 1.0)
-    return hessian, gradient, matches
+    return hessian, gradient, matches, cost / weights
 
 
 def _as_held(T: Float64, T_fitted: Float64, hessian: Float64) -> Float64:
@@ -302,7 +312,7 @@ def _register(
             count += 1
     seen = seen[:count]
     for reach_m in REACHES_M:
-        hessian, step, matches = _system(rows, seen, T, view, reach_m)
+        hessian, step, matches, _ = _system(rows, seen, T, view, reach_m)
         if matches < MIN_MATCHES:
             return seen, False, T, system
         system[:] = hessian
@@ -451,6 +461,10 @@ LEAK_PATH = 10.0
 VARIANCE_GAIN, MAX_RATIO = 0.05, 9.0
 # A frame's own error counts beyond twice the error of a registration.
 OUTLIER_STEP = 4.0
+# A frame may fit the map at a wrong place, too: along a corridor, or where little of it is known.
+# So a larger step counts only if the frame fits so much better there, and in the mean error as one
+# of so many standard deviations. A jump of 20 cm is still followed, a few frames later.
+LARGE_STEP_M, BETTER, MOST_SIGMAS = 0.03, 0.7, 4.0
 
 
 class Drift:
@@ -487,7 +501,7 @@ class Drift:
         T_given, grid = local.T_world_camera, local.depth_grid
         if grid is None:
             return local
-        fitted = self._map.register(self._T_map_poses @ T_given, grid)
+        fitted = self._fitted(self._T_map_poses @ T_given, grid)
         own, rest = (0.0, np.zeros(6)) if fitted is None else self._learn(T_given, fitted)
         mean = difference(T_given, self._T_map_poses @ T_given)
         mean_noise_m2 = self._trembling_m2 * (self._gain / (2.0 - self._gain) + FIRST_FRACTION)
@@ -500,6 +514,15 @@ class Drift:
         T_corrected = stepped(own * rest, stepped(drift * mean, T_given))
         return moved(local, T_corrected @ invert_pose(T_given))
 
+    def _fitted(self, expected: Float64, grid: DepthGrid) -> Float64 | None:
+        """The pose at which a frame fits the map, or the expected one if it fits about as well."""
+        fitted = self._map.register(expected, grid)
+        if fitted is None or _squared(difference(expected, fitted)) < LARGE_STEP_M**2:
+            return fitted
+        return (
+            fitted if self._map.misfit(fitted) < BETTER * self._map.misfit(expected) else expected
+        )
+
     def _learn(self, T_given: Float64, fitted: Float64) -> tuple[float, Float64]:
         """Update the mean error; returns the rest of this frame, and the part to correct."""
         self._frames += 1
@@ -509,6 +532,8 @@ class Drift:
         ratio = DRIFT_VARIANCE_M2 / self._trembling_m2
         self._gain = (math.sqrt(ratio**2 + 4.0 * ratio) - ratio) / 2.0
         gain = max(self._gain, 1.0 / self._frames)
+        most = MOST_SIGMAS * math.sqrt(self._trembling_m2 + FIT_VARIANCE_M2)
+        gain *= min(1.0, most / max(math.sqrt(_squared(step)), 1e-9))
         self._T_map_poses = about_camera(gain * step, expected) @ self._T_map_poses
         # The difference of two successive errors contains no drift, and twice the trembling.
         change_m2 = min(_squared(error - self._error) / 2.0, MAX_RATIO * self._trembling_m2)

@@ -1,6 +1,7 @@
 """Drift: exact poses stay, drift and jumps are found, trembling is not taken for drift."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,7 +10,17 @@ from support.surfaces import CAMERA, CUP, frame, slab
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.poses.drift import MAX_SURFELS, Drift, SurfelMap, difference, moved
+from deworldsg_ros.poses.drift import (
+    FAR_M,
+    MAX_SURFELS,
+    NEAR_M,
+    SAMPLES,
+    Drift,
+    SurfelMap,
+    difference,
+    moved,
+)
+from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid
 
 # Floor, ceiling and walls of a room, and two sides of a box in it: normals n and offsets n · x.
@@ -123,6 +134,64 @@ def test_noise_does_not_move_a_pose_along_a_corridor():
     for T in poses:  # each with a noise of its own
         fitted = surfels.register(T, depth_of(T, corridor))
         assert fitted[2, 3] == pytest.approx(T[2, 3], abs=0.001)
+
+
+def test_one_wrong_frame_is_no_drift():
+    error = pose(shift_m=(0.25, 0.0, 0.1))
+    drift = Drift()
+    aligned(lambda stamp: pose(), 30, drift)
+    for stamp in range(30, 33):
+        T = path(stamp)
+        drift.align(seen(stamp, T, (error if stamp == 30 else pose()) @ T))
+        assert np.linalg.norm(drift.T_graph_poses[:3, 3]) < 0.02
+
+
+def moved_by(wrong, register, T, grid):
+    """Registers a frame, and takes another pose for the one that fits."""
+    register(T, grid)
+    return wrong @ T
+
+
+def test_a_far_step_counts_only_if_the_frame_fits_much_better_there(monkeypatch):
+    drift, T = Drift(), path(30)
+    aligned(lambda stamp: pose(), 30, drift)
+    local, register = seen(30, T, T), drift._map.register
+    for wrong_m in (0.05, 0.25):
+        wrong = pose(shift_m=(wrong_m, 0.0, 0.0))
+        monkeypatch.setattr(drift._map, "register", partial(moved_by, wrong, register))
+        assert drift.align(local) is local
+    # Now the pose is wrong, and where the frame fits is right.
+    local = seen(30, T, invert_pose(wrong) @ T)
+    corrected = drift.align(local).T_world_camera
+    assert np.linalg.norm(difference(T, corrected)[3:]) < 0.03
+
+
+def test_the_misfit_is_that_of_each_surfel():
+    surfels, grid = SurfelMap(), depth_of(pose())
+    surfels.register(pose(), grid)
+    surfels.add(pose())
+    for shift_m, turn_deg in ((0.0, 0.0), (0.04, 1.0), (0.3, 0.0)):
+        T = pose((0.0, turn_deg, 0.0), (shift_m, 0.0, shift_m))
+        surfels.register(pose(), grid)
+        costs = []
+        rows = surfels.rows[surfels.seen]
+        for row in rows[:: max(1, len(rows) // SAMPLES)]:
+            ahead = invert_pose(T) @ [*row[:3], 1.0]
+            u = (CAMERA.fx * ahead[0] / ahead[2] + CAMERA.cx - 4) / 8
+            v = (CAMERA.fy * ahead[1] / ahead[2] + CAMERA.cy - 4) / 8
+            column, line = int(u + 0.5), int(v + 0.5)
+            if min(column, line) < 0 or column >= 80 or line >= 60 or ahead[2] < NEAR_M:
+                continue
+            z = 0.001 * grid.depth_mm[line, column]
+            if not NEAR_M < z <= FAR_M:
+                continue
+            point = CAMERA.back_project(
+                np.array(8 * column + 4), np.array(8 * line + 4), np.array(z)
+            )
+            away = row[:3] - (T[:3, :3] @ point + T[:3, 3])
+            gap = min(abs(away @ row[3:6]), 0.1) if np.linalg.norm(away) <= 0.2 else 0.1
+            costs.append(np.log1p((gap / (3.0 * (0.004 + 0.002 * z**2))) ** 2))
+        assert surfels.misfit(T) == pytest.approx(np.mean(costs), rel=0.02)
 
 
 def test_the_map_is_bounded_and_forgets_surfaces_that_are_gone():
