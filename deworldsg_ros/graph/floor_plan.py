@@ -193,19 +193,21 @@ def _counted(plan: Float32, corner: Float64, cell_m: float, shape: tuple[int, in
 # the depth. What is a node already is left out first, so that parts of two things that touch
 # can still be told apart. The numbers were chosen on one rendered room and the shipped recording.
 
-# Views that are kept, the newest: 5 MB of 80 x 60 pixels each. Things are few pixels wide, so the
-# views are denser than those of `SeenSpace`.
+# The newest 512 views are kept: 5 MB if each has 80 x 60 pixels. A view is kept if the camera moved
+# by STEP_M or turned by 3 degrees. Things are few pixels wide, so the views are denser than those of
+# `SeenSpace`.
 MOST_GLANCES = 512
 STEP_M, STEP_TRACE = 0.05, 1.0 + 2.0 * math.cos(math.radians(3.0))
-# Of these, those are searched that are so near to the newest one.
+# Views within this distance of the newest one are searched.
 REACH_M = 15.0
-# And so many tell what can be seen through.
+# Whether a cell can be seen through is tested in at most about this number of them.
 LOOKS = 60
 # Depth is used from and to here; farther away, a pixel is wider than a cup.
 NEAREST_M, FARTHEST_M = 0.25, 3.5
 # Edge of a cell. Surfaces are level whose normals are within 32 degrees of up.
 THING_CELL_M, LEVEL = 0.02, 0.85
-# Columns of cells with points in so many layers are of walls and of sides of furniture.
+# A column of cells belongs to a wall or to the side of furniture if at least TALL of its layers,
+# each 10 cm high, have points.
 LAYER_TALL_M, TALL = 0.1, 10
 # A support: its least area, and the greatest, which a floor exceeds; its least height above the
 # floor; the width of gaps and bays that things on it leave.
@@ -215,9 +217,11 @@ LIFT_M, MOST_M = 0.014, 0.5
 # The least points, width, area and height of a thing; the least number of views and viewpoints.
 THING_POINTS, THING_M, THING_M2, THING_HEIGHT_M = 60, 0.05, 0.0012, 0.02
 THING_VIEWS, THING_VIEWPOINTS = 3, 2
-# Of the cells around it, so many show the support, and of those that show anything, so many show
-# something else. Of the looks at its cells, so many show them.
-AROUND, OTHERS, AGREED = 0.2, 0.3, 0.8
+# Around a thing, at least AROUND of the cells show the support. Of the cells there that show
+# anything, at most OTHERS show something else.
+AROUND, OTHERS = 0.2, 0.3
+# At least AGREED of the views of its cells show a surface there; the others see through.
+AGREED = 0.8
 # Viewpoints differ by an angle, or by a factor of the distance.
 VIEWPOINT_RAD, VIEWPOINT_RATIO = math.radians(15.0), 1.4
 # Boxes of nodes are wider by this; larger ones are of furniture, which is below things.

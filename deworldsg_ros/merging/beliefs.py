@@ -189,8 +189,8 @@ VIEW_COS = math.cos(VIEW_RAD)
 VIEW_RATIO = 1.2
 # Viewpoints of a node that are remembered. Of more, the oldest one counts for good.
 VIEWS = 12
-# A thing that no detector fires at is as probable as one that so many viewpoints have detected:
-# 0.82 in a new graph. Fewer than `assume` is given otherwise.
+# A thing that no detector fires at gets the existence of an object that was detected from two
+# viewpoints: 0.82 in a new graph. Nodes that were detected get at least three from `assume`.
 THING_LOOKS = 2.0
 # Frames of a viewpoint that count, two seconds of video: of more, the older half counts half. A
 # camera that stands still may see more than before, when the light changes or a person has gone.
@@ -412,5 +412,5 @@ def merge(record: Any, other: Any, mean_world: Float64) -> None:
 
 
 def assume(record: Any, looks: float) -> None:
-    """Fill the record of a node that has no viewpoints, as if so many had detected it."""
+    """Fill the record of a node without viewpoints, as if `looks` viewpoints had detected it."""
     record["best_score"], record["looks"] = 0.9, looks
