@@ -194,8 +194,8 @@ def _counted(plan: Float32, corner: Float64, cell_m: float, shape: tuple[int, in
 # can still be told apart. The numbers were chosen on one rendered room and the shipped recording.
 
 # The newest 512 views are kept: 5 MB if each has 80 x 60 pixels. A view is kept if the camera moved
-# by STEP_M or turned by 3 degrees. Things are few pixels wide, so the views are denser than those of
-# `SeenSpace`.
+# by STEP_M or turned by 3 degrees. Things are few pixels wide, so the views are denser than those
+# of `SeenSpace`.
 MOST_GLANCES = 512
 STEP_M, STEP_TRACE = 0.05, 1.0 + 2.0 * math.cos(math.radians(3.0))
 # Views within this distance of the newest one are searched.
