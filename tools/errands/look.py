@@ -10,6 +10,7 @@ from home import CELL_M
 from robot import CAMERA, CAMERA_M, TILT_RAD, Planner, Robot
 from scipy.spatial.transform import Rotation
 
+from deworldsg_ros.client.boxes import point_gaps_m
 from deworldsg_ros.client.objects import SceneObject
 from deworldsg_ros.scene.camera import invert_pose
 
@@ -42,9 +43,7 @@ def box_frame(item: SceneObject, points: np.ndarray) -> np.ndarray:
 
 def gap_m(item: SceneObject, place: np.ndarray) -> float:
     """Distance of a place (2,) from the outline of a box."""
-    point = np.array([[place[0], place[1], item.position_m[2]]])
-    out = np.maximum(np.abs(box_frame(item, point)[0]) - np.array(item.size_m) / 2, 0.0)
-    return float(np.linalg.norm(out[:2]))
+    return float(point_gaps_m(place[:2], item.footprint.corners[None])[0])
 
 
 def pixels_of(item: SceneObject, robot: Robot, T_graph_map: np.ndarray) -> int:
