@@ -48,8 +48,9 @@ from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.wire import messages as wire
 
-# Constants were chosen on homes 0 to 11. Reported before: 100 to 111, 200 to 211, 300 to 304.
-FIRST, HOMES = 312, 12
+# Constants were chosen on homes 0 to 11. Reported before: 100 to 111, 200 to 211, 300 to
+# 304, 312 to 323.
+FIRST, HOMES = 324, 12
 ROBOT = Robot(radius_m=0.25, height_m=1.3)
 CAMERA_M, DOWN_RAD, FAR_M = 1.2, 0.3, 4.5
 # A frame after so much way, or turn.
