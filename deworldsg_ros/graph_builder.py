@@ -56,7 +56,7 @@ class GraphBuilder:
         space: the space that the camera has seen as free.
         trail: the poses of the frames.
         poses_frame: world frame of the local graphs and corrections to come.
-        rooms: the rooms of that space, as of the last `find_rooms` or `set_rooms`.
+        rooms: the rooms of that space, as of the last `find_rooms_and_things` or `set_rooms`.
         things: views for `find_things`; None = not configured.
         prior: of class pairs.
         refused: what was left out of the newest frame, in words, by reason.
@@ -250,7 +250,7 @@ class GraphBuilder:
         """Whether rooms are looked for: the paper has none."""
         return self._drift is not None and len(self.space) > 0
 
-    def find_rooms(self) -> None:
+    def find_rooms_and_things(self) -> None:
         """Find the things and the rooms of what was seen so far; takes some seconds."""
         self.find_things()
         if self.has_rooms:

@@ -283,7 +283,7 @@ def follow_trajectory(path: Path, trajectory_path: Path) -> EditReply:
         builder.trail.T_body_camera = np.eye(4)
         builder.apply_trajectory(stamps_ns, known.T_world_cameras)
         builder.settle()
-        builder.find_rooms()
+        builder.find_rooms_and_things()
         after = {node_id: nodes.means[slot] for node_id, slot in nodes.slot_of.items()}
         steps_m = [float(np.linalg.norm(after[i] - before[i])) for i in after]
     moved = sum(step_m > 0 for step_m in steps_m)

@@ -321,20 +321,20 @@ def test_rooms_are_in_the_graph_the_map_and_edits(tmp_path: Path) -> None:
     builder = builder_of(*(frame(stamp, (WHOLE, TABLE)) for stamp in range(1, 5)), config=config)
     assert builder.full().rooms is UNSET
     builder.space = seen_room()
-    builder.find_rooms()
+    builder.find_rooms_and_things()
     (room,) = builder.full().rooms
     assert 8.0 < room.area_m2 < 12.5 and room.objects[0].id == 1
     update = builder.update()
     assert update.rooms == [room] and update.storeys_m == [pytest.approx(0.0, abs=0.05)]
     assert builder.snapshot().rooms == [room]
-    builder.find_rooms()
+    builder.find_rooms_and_things()
     assert builder.update() is None  # nothing new
     path = saved(builder, tmp_path)
     for words, label in ((["study"], "study"), ([], room.label)):
         done = CliRunner().invoke(app, ["edit", str(path), "name_room", str(room.id), *words])
         assert done.exit_code == 0, done.output
         again = read_map(config, path)
-        again.find_rooms()
+        again.find_rooms_and_things()
         (kept,) = again.full().rooms
         assert (kept.id, kept.label) == (room.id, label)
     refused = CliRunner().invoke(app, ["edit", str(path), "name_room", "9", "study"])
@@ -344,5 +344,5 @@ def test_rooms_are_in_the_graph_the_map_and_edits(tmp_path: Path) -> None:
 def test_the_paper_has_no_rooms() -> None:
     builder = seen(4, association="paper")
     builder.space = seen_room()
-    builder.find_rooms()
+    builder.find_rooms_and_things()
     assert builder.full().rooms is UNSET and not builder.rooms.arrays()

@@ -357,7 +357,7 @@ def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
     """Write the graph, its views, the report, the trajectory and the map; print the tables."""
     pipeline, processed = ran.pipeline, ran.processed
     if pipeline.builder is not None:
-        pipeline.builder.find_rooms()
+        pipeline.builder.find_rooms_and_things()
     graph, T_graph_world = pipeline.graph(), np.eye(4)
     if pipeline.returning is not None and pipeline.returning.found is not None:
         T_graph_world = pipeline.returning.found.T_map_world

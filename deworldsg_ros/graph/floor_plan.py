@@ -241,13 +241,14 @@ class Glance(NamedTuple):
 class Thing(NamedTuple):
     """Surface points (n, 3) float32 of a thing, metres, world, and their keyframes (n,).
 
-    first_ns and last_ns are the stamps of the first and the last view that shows it.
+    first_ns and last_ns are the stamps of the first and the last of the `views` that show it.
     """
 
     points_world: Float32
     keyframes: UInt16
     first_ns: int
     last_ns: int
+    views: int
 
 
 class FoundThings(NamedTuple):
@@ -329,9 +330,12 @@ class Things:
             ends = np.quantile(points, (0.02, 0.98), axis=0)
             if any(_overlap(ends, other) for other, _ in found):
                 continue
-            seen_ns = stamps_ns[cloud.of[rows]]
-            span_ns = int(seen_ns.min()), int(seen_ns.max())
-            thing = Thing((points @ axes).astype(np.float32), keyframes[cloud.of[rows]], *span_ns)
+            views = np.unique(cloud.of[rows])
+            seen_ns = stamps_ns[views]
+            thing = Thing(
+                (points @ axes).astype(np.float32), keyframes[cloud.of[rows]],
+                int(seen_ns.min()), int(seen_ns.max()), len(views),
+            )  # fmt: skip
             found.append((ends, thing))
         since_ns = max(left_out, default=int(stamps_ns.min()))
         return FoundThings([thing for _, thing in found], since_ns, self.moves)

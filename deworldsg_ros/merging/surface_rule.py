@@ -150,7 +150,7 @@ class SurfaceMerging:
                 records.map.remove(slot)
                 nodes.put(slot, *moments, classes, 1.0, observations=1)
             nodes.set_surface(slot, thing.points_world, thing.keyframes)
-            nodes.last_seen_ns[slot] = thing.last_ns
+            nodes.last_seen_ns[slot], nodes.observations[slot] = thing.last_ns, thing.views
             slots.append(slot)
         records.map.add(slots, sets)
         records.place(graph, slots)

@@ -60,7 +60,7 @@ def page(root_dir, demo_out, monkeypatch):
         builder.integrate(view(stamp, (HERE, CUP)))
     builder.edit(SetLabel(1, "mug"))
     builder.space = seen_room()
-    builder.find_rooms()
+    builder.find_rooms_and_things()
     write_map(builder, Path("room.map"))
     poses = [f"{stamp / 10} 0.1 0 0 0 0 0 1\n" for stamp in range(1, 8)]
     Path("slam.txt").write_text("".join(poses))
