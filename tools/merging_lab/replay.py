@@ -8,6 +8,7 @@ The graph of a capture equals that of `deworldsg evaluate run` with the same det
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 import time
@@ -37,7 +38,8 @@ from deworldsg_ros.evaluation.graph_measures import (
     read_reference,
 )
 from deworldsg_ros.evaluation.graph_measures import pool as pool_measures
-from deworldsg_ros.evaluation.recorded_room import open_annotations
+from deworldsg_ros.evaluation.recorded_room import Truth as Marks
+from deworldsg_ros.evaluation.recorded_room import open_annotations, read_marked
 from deworldsg_ros.evaluation.runner import to_prediction, translate, translation
 from deworldsg_ros.evaluation.scoring import ProtocolOptions, ScanResult, pool, score_scan
 from deworldsg_ros.graph_builder import GraphBuilder
@@ -134,6 +136,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         replayed = replay(capture, config)
         if not capture.layout:
             print(f"{capture.name:32s} {unannotated_line(capture, replayed)}", flush=True)
+            if options.marked is not None:
+                marks = read_marked(options.marked)
+                print(*marked_lines(replayed.graph, marks, options.edges), sep="\n", flush=True)
             continue
         scores.append(score(capture, replayed))
         print(scores[-1].line(), flush=True)
@@ -351,6 +356,66 @@ def read_list(path: Path) -> ReferenceScene:
     )
 
 
+# --- Recordings whose objects are marked as boxes, and whose relations were judged by hand.
+
+EDGE_PROBABILITY = 0.5
+# A node with a name is of an object within the margin of marks; one without has its mean in the
+# box. Of several objects, the nearest: a hundredth of the distance to the middle decides inside.
+UNNAMED_MARGIN_M = 0.05
+MIDDLE_WEIGHT = 0.01
+
+
+def marked_lines(graph: wire.SceneGraphMessage, marks: Marks, edges: Path | None) -> list[str]:
+    """Named nodes against marked objects; with a file of true relations, each edge against it."""
+    named = [node for node in graph.nodes if node.named]
+    rows = [nearest_mark(node, marks) for node in named]
+    right = [row for row in rows if row is not None]
+    found, precision = len(set(right)), len(right) / max(len(rows), 1)
+    lines = [
+        f"    of {len(marks.objects)} marked objects {found} found, {len(right) - found} "
+        f"duplicates; {len(named)} nodes with a name, precision {precision:.2f}"
+    ]
+    if edges is None:
+        return lines
+    content = json.loads(edges.read_text())
+    things = read_marked(edges).objects if content["objects"] else ()
+    marks = dataclasses.replace(marks, objects=(*marks.objects, *things))
+    true = {(subject, name, other) for subject, name, other in content["relations"]}
+    true |= {(b, name, a) for a, name, b in true if name == "near"}
+    at = {node.id: nearest_mark(node, marks) for node in graph.nodes}
+    ids = {node: "?" if row is None else marks.objects[row].id for node, row in at.items()}
+    said = {node.id: f"{node.label} #{node.id} ({ids[node.id]})" for node in graph.nodes}
+    judged = [
+        ((ids[edge.subject], item.label, ids[edge.object]) in true, edge, item)
+        for edge in graph.edges
+        for item in edge.predicates
+        if item.probability >= EDGE_PROBABILITY
+    ]
+    count = sum(is_right for is_right, _, _ in judged)
+    lines.append(f"    of {len(judged)} edges {count} right; the others:")
+    lines += [
+        f"      {said[edge.subject]} {item.label} {said[edge.object]} {item.probability:.2f}"
+        for is_right, edge, item in judged
+        if not is_right
+    ]
+    return lines
+
+
+def nearest_mark(node: wire.NodeState, marks: Marks) -> int | None:
+    """Row of the marked object that a node is; None if it has another name, or is elsewhere."""
+    mean, best, least = np.array(node.mean_m), None, np.inf
+    limit_m = marks.margin_m if node.named else UNNAMED_MARGIN_M
+    for row, item in enumerate(marks.objects):
+        if node.named and not marks.is_right(row, node.label):
+            continue
+        gap_m = np.linalg.norm(np.maximum(np.maximum(item.low - mean, mean - item.high), 0))
+        middle_m = np.linalg.norm((item.low + item.high) / 2 - mean)
+        distance_m = float(gap_m + MIDDLE_WEIGHT * middle_m)
+        if distance_m < min(least, limit_m):
+            best, least = row, distance_m
+    return best
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -361,6 +426,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--skip", nargs="+", default=[], metavar="PATTERN", help="leave these captures out")
     add("--config", type=Path, help="ROS parameter file; default: the built-in defaults")
     add("--settings", nargs="+", default=[], metavar="SECTION.FIELD=VALUE", help="set options")
+    add("--marked", type=Path, help="boxes of the objects of recordings without annotation")
+    add("--edges", type=Path, help="with --marked: the true relations, edges_*.json")
     add("--missed", action="store_true", help="list the objects that have no node")
     add("--json", type=Path, help="write every number by name to this file")
     return parser
