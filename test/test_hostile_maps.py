@@ -160,6 +160,7 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
     "more detections than frames": field("view_detected", 0, 1e6),
     "looks that are all detections": changed("merging.looks", lambda a: a * 0 + 5.0),
     "no fates": changed("merging.fates", lambda a: a * 0),
+    "more contradictions than viewpoints": changed("merging.said", lambda a: a + [1, 0]),
     "a block twice": changed("merging.blocks", lambda a: a * 0 + a[0]),
     "a block beyond space": changed("merging.blocks", put(0, -1)),
     "an empty mask": changed("merging.masks", put(0, 0)),

@@ -33,6 +33,12 @@ OUTLIERS = 0.4
 # name surer than the view that was surest of it. All classes evenly share the rest, at least
 # OTHERS.
 OTHERS = 0.05
+# This doubt is smaller for a source that rarely contradicts itself: such sources are also rarely
+# wrong on all sides (docs/dev/merging.md). DRAWN * WRONG of the new viewpoints are expected to
+# contradict the name of their node, as if PRIOR_VIEWPOINTS had been observed. If fewer do, the
+# doubt is the smaller, but LEAST_DOUBT of it stays: what is wrong everywhere contradicts nothing.
+PRIOR_VIEWPOINTS = 20.0
+LEAST_DOUBT = 0.1
 
 # The part of a node's record that belongs to its name: the labels (-1 = none), the probability
 # of each class (row) with each name (column), and the place of the viewpoint that says it (-1 =
@@ -44,6 +50,19 @@ NAME_FIELDS: list[Any] = [
     # The probability of each label in the view that was most certain of it.
     ("most_certain", np.float64, LABELS),
 ]
+
+
+def first_said() -> Int64:
+    """Number of new viewpoints that contradicted the name of their node, and of all: (2,)."""
+    return np.zeros(2, np.int64)
+
+
+def doubt(said: Int64) -> float:
+    """The factor, from LEAST_DOUBT to 1, of the doubt about names; `said` as in `first_said`."""
+    contradictions, viewpoints = said.tolist()
+    expected = DRAWN * WRONG
+    share: float = (PRIOR_VIEWPOINTS * expected + contradictions) / (PRIOR_VIEWPOINTS + viewpoints)
+    return min(1.0, max(LEAST_DOUBT, share / expected))
 
 
 def most_certain(*records: Any) -> dict[int, float]:
@@ -76,6 +95,8 @@ def start(
 @kernel
 def observe_names(
     records: NDArray[Any],
+    said: Int64,
+    doubted: float,
     slots: Int64,
     seen: Float64,
     means_world: Float64,
@@ -86,6 +107,8 @@ def observe_names(
 
     Args:
         records: with `NAME_FIELDS` and `EXISTENCE_FIELDS`; those of the slots are updated.
+        said: see `first_said`; updated.
+        doubted: the `doubt`.
         slots: (n,) index of each node's record.
         seen: (n, C) distributions of the detections.
         means_world: (n, 3) means of the nodes, metres.
@@ -98,6 +121,11 @@ def observe_names(
         is_new = place < 0 or record.view_named[place] == 0
         if place < 0:
             place = record.views % VIEWS  # where `observe_existence` puts it
+        # A long look at one node says little of others: the first VIEWS of each count.
+        if is_new and 0 < record.views < VIEWS:
+            best_label = record.labels[record.joint.sum(axis=1).argmax()]
+            said[0] += int(np.argmax(seen[index]) != best_label)
+            said[1] += 1
         if is_new or place == record.named_from:
             _name(record, seen[index], is_new)
             record.named_from = place
@@ -110,7 +138,7 @@ def observe_names(
                 record.most_certain[i] = max(record.most_certain[i], seen[index, record.labels[i]])
                 if belief > best:
                     best, certain = belief, record.most_certain[i]
-        others = max(OTHERS, 1.0 - certain)
+        others = doubted * max(OTHERS, 1.0 - certain)
         classes[index] = others / seen.shape[1]
         for i in range(LABELS):
             if record.labels[i] >= 0:

@@ -62,6 +62,9 @@ def check_memory(memory: Arrays, record: np.dtype[np.void], class_count: int) ->
     # The rate of detections is below one: its logarithm is taken.
     holds("looks", (looks[:, 1] < looks[:, 0]).all(), "fewer detections than looks")
     within("fates", checked(memory, "fates", np.int64, 2), 1, 2**52)
+    said = checked(memory, "said", np.int64, 2)
+    within("said", said, 0, 2**52)
+    holds("said", said[0] <= said[1], "no more contradictions than viewpoints")
     frames = checked(memory, "frames", np.int64)
     within("frames", frames, 0, 2**52)
     within("records (last_frame)", records["last_frame"], 0, 2**52)
@@ -173,6 +176,7 @@ class NodeRecords:
         rows: (n,) of `RECORD`, by slot; ``node_id`` is 0 where there is no record.
         looks: viewpoints at objects and those that detected them (`beliefs.first_counts`).
         fates: errors and objects among the nodes so far (`beliefs.first_fates`).
+        said: viewpoints so far that contradicted the name of their node, and all of them.
         frames: number of frames so far.
         map: cells of the surfaces, by slot.
         grid: slots by the position of their node.
@@ -183,6 +187,7 @@ class NodeRecords:
         self.rows: NDArray[np.void] = np.zeros(64, RECORD)
         self.looks = beliefs.first_counts()
         self.fates = beliefs.first_fates()
+        self.said = beliefs.first_said()
         self.frames = 0
         self.map = VoxelMap()
         self.grid = NodeGrid()
@@ -288,7 +293,10 @@ class NodeRecords:
         """Class distributions (n, C) of n detected nodes; see `beliefs.observe_names`."""
         self.rows["last_frame"][slots] = self.frames
         classes, camera = np.empty_like(seen), np.ascontiguousarray(camera_world)
-        beliefs.observe_names(self.rows, slots, seen, means_world, camera, classes)
+        doubted = beliefs.doubt(self.said)
+        beliefs.observe_names(
+            self.rows, self.said, doubted, slots, seen, means_world, camera, classes
+        )
         return classes
 
     def existence(self, slots: Int64) -> Float64:
@@ -378,6 +386,7 @@ class NodeRecords:
             "records": repack_fields(self.rows[slots]),
             "looks": self.looks,
             "fates": self.fates,
+            "said": self.said,
             "frames": np.array(self.frames),
             "recent_poses": np.array([T for T, _ in self.recent]).reshape(-1, 4, 4),
             "recent_cameras": np.array([camera for _, camera in self.recent]).reshape(-1, 6),
@@ -401,7 +410,8 @@ class NodeRecords:
             memory = {**memory, "scores": both}
         if "records" not in memory:
             raise ValueError("the map has no records: it is damaged")
-        memory = {**memory, "records": _with_certainties(memory["records"])}
+        whole = _with_certainties(memory["records"])
+        memory = {"said": beliefs.first_said(), **memory, "records": whole}
         check_memory(memory, RECORD, len(graph.vocabulary.classes))
         records, counts = memory["records"], memory["block_counts"]
         kept = np.isin(records["node_id"], node_ids)
@@ -412,6 +422,7 @@ class NodeRecords:
         self.rows[known] = records[everything if every else kept]
         self.looks[:] = memory["looks"]
         self.fates[:] = memory["fates"]
+        self.said[:] = memory["said"]
         self.frames = int(memory["frames"])
         self.recent.extend(zip(memory["recent_poses"], memory["recent_cameras"]))
         own = everything if every else np.repeat(kept, counts)

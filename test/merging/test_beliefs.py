@@ -287,6 +287,7 @@ COUNT = 12
 def named(frames: list[np.ndarray], frames_per_view: int = 3) -> np.ndarray:
     """Class distribution after frames with these distributions, on a way around the node."""
     records, classes = NodeRecords(), frames[0][None]
+    records.said[:] = 10**9  # of a source that earns nothing
     records.add(0, 1, frames[0])
     look(records, 0, 0, 0.9)
     for index, seen in enumerate(frames[1:], 1):
@@ -382,6 +383,54 @@ def test_a_viewpoint_says_its_name_once() -> None:
             look(records, 0, position, 0.9)
         found.append(classes[0])
     np.testing.assert_allclose(*found)
+
+
+def names_of_nodes(labels: np.ndarray) -> tuple[np.ndarray, NodeRecords]:
+    """The distribution of each of n nodes after views (n, k) from as many sides, node by node."""
+    records, found = NodeRecords(), []
+    for slot, views in enumerate(labels):
+        frames = frames_of(views.tolist(), 0.9)
+        records.add(slot, slot + 1, frames[0])
+        look(records, slot, 0, 0.9)
+        for position, seen in enumerate(frames[1:], 1):
+            where = np.zeros((1, 3)), camera_at(position)
+            classes = records.name(np.array([slot]), seen[None], *where)
+            look(records, slot, position, 0.9)
+        found.append(classes[0])
+    return np.array(found), records
+
+
+def test_names_of_a_source_that_agrees_with_itself_become_surer_node_by_node() -> None:
+    found, records = names_of_nodes(np.repeat(np.arange(40) % COUNT, 10).reshape(40, 10))
+    surest = found.max(axis=1)
+    assert (found.argmax(axis=1) == np.arange(40) % COUNT).all()
+    assert (np.diff(surest) >= 0).all() and surest[0] < 0.94 and 0.97 < surest[-1] < 1.0
+    # What is wrong everywhere agrees, too: some doubt stays.
+    records.said[:] = 0, 10**9
+    assert beliefs.doubt(records.said) == beliefs.LEAST_DOUBT
+
+
+def test_names_of_a_source_that_contradicts_itself_are_as_at_first() -> None:
+    labels = np.repeat(np.arange(40) % COUNT, 10).reshape(40, 10)
+    labels[:, 1] = (labels[:, 1] + 1) % COUNT
+    found, records = names_of_nodes(labels)
+    assert beliefs.doubt(records.said) == 1.0
+    assert found.max() <= 0.9 + 0.1 / COUNT + 1e-9
+
+
+@pytest.mark.parametrize("contradictions", [0, 1, 5, 60])
+def test_more_viewpoints_that_agree_never_add_doubt(contradictions: int) -> None:
+    counts = np.arange(contradictions, 2000)
+    doubts = [beliefs.doubt(np.array([contradictions, count])) for count in counts]
+    assert (np.diff(doubts) <= 0).all() and max(doubts) <= 1.0
+    more = [beliefs.doubt(np.array([contradictions + 1, count + 1])) for count in counts]
+    assert (np.array(more) >= doubts).all()
+
+
+def test_a_long_look_at_one_node_says_little_of_its_source() -> None:
+    _, few = names_of_nodes(np.full((1, beliefs.VIEWS), 3))
+    _, many = names_of_nodes(np.full((1, 40), 3))
+    assert few.said.tolist() == many.said.tolist() == [0, beliefs.VIEWS - 1]
 
 
 # --- stamps --------------------------------------------------------------------------------------

@@ -360,14 +360,19 @@ def test_a_map_continues_the_evidence(tmp_path: Path) -> None:
             one, other = again.graph.state(), whole.graph.state()
             np.testing.assert_array_equal(one.surface_points, other.surface_points)
             np.testing.assert_array_equal(one.surface_counts, other.surface_counts)
-    # An older release has one score of a cell.
     arrays = graph_files.read(path)
+    arrays["merging.said"] = np.array([2, 9])
+    graph_files.write(path, arrays)
+    assert read_map(config, path).merging.memory()["said"].tolist() == [2, 9]
+    # An older release has one score of a cell.
     arrays["merging.scores"] = np.ascontiguousarray(arrays["merging.scores"][:, SURFACE])
     names = [name for name in RECORD.names or () if name != "most_certain"]
     arrays["merging.records"] = repack_fields(arrays["merging.records"][names])
+    del arrays["merging.said"]
     graph_files.write(path, arrays)
     memory = read_map(config, path).merging.memory()
     assert memory["scores"].shape[1:] == (2, 64) and (memory["records"]["most_certain"] == 1).all()
+    assert memory["said"].tolist() == [0, 0]
     # A map of an older release starts without evidence.
     arrays = graph_files.read(path)
     for name in ("scores", "records", "looks", "fates", "frames"):
