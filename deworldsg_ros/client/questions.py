@@ -29,6 +29,8 @@ from deworldsg_ros.scene.errors import ClientError
 
 # Answers that are less probable are left out.
 MIN_PROBABILITY = 0.05
+# Nothing is the second, third, … of an order if the most probable one is that with less.
+MIN_RANKED = 0.2
 # The opposite of "on".
 UNDER = frozenset({"under", "below"})
 # The most that one question may cost: objects that are compared, and seconds. A question that a
@@ -304,7 +306,7 @@ def _understood(graph: SceneGraph, asked: Pattern) -> tuple[Pattern, list[str]]:
 
 
 def _ranked(graph: SceneGraph, rank: Rank, answers: list[Answer]) -> tuple[list[Answer], list[str]]:
-    """The sure answers by a rank, each with what was compared, the one that is meant first."""
+    """The one that most probably has a rank, and the sure ones after it; each says what counts."""
     kind, most_first = RANKS[rank.word]
     near: Point | SceneObject | None = rank.point
     if rank.thing is not None or rank.colour is not None:
@@ -326,16 +328,40 @@ def _ranked(graph: SceneGraph, rank: Rank, answers: list[Answer]) -> tuple[list[
             return item.size_m[2], f"{item.size_m[2]:.2f} m high"
         return item.height_m, f"{item.height_m:.2f} m above the origin"
 
-    # A doubtful object does not win by its size.
-    known = [answer for answer in answers if answer.probability >= 0.5] or answers
     if isinstance(near, SceneObject):
-        known = [answer for answer in known if answer.item.id != near.id]
+        answers = [answer for answer in answers if answer.item.id != near.id]
+    known = answers
+    if kind != "distance":
+        # What is false has odd sizes and places: a doubtful object does not win by its size.
+        known = [answer for answer in answers if answer.probability >= 0.5] or answers
     compared = [(value(answer.item), answer) for answer in known]
     compared.sort(key=lambda pair: pair[0][0], reverse=most_first)
     found = [replace(one, evidence=f"{one.evidence}; {text}") for (_, text), one in compared]
-    doubtful = len(answers) - len(known)
-    notes = [f"{counted(doubtful, 'doubtful object')} not compared"] if doubtful > 0 else []
-    return found[rank.place - 1 :], notes
+    at = _place_of(rank.place, [one.probability for one in found])
+    if at is None:
+        return [], []
+    later = [one for one in found[at + 1 :] if one.probability >= 0.5]
+    doubtful = sum(answer.probability < 0.5 for answer in answers)
+    how = "not compared" if len(known) < len(answers) else "counted by probability"
+    notes = [f"{counted(doubtful, 'doubtful object')} {how}"] if doubtful else []
+    return [found[at], *later], notes
+
+
+def _place_of(rank: int, probabilities: Sequence[float]) -> int | None:
+    """Which of several objects in an order is most probably the one of a rank, from 1 on.
+
+    Each counts by its probability, independent of the others. None = nothing is probable enough.
+    """
+    before = [1.0] + [0.0] * (rank - 1)  # that so many of those before an object are there
+    found = []
+    for probability in probabilities:
+        found.append(probability * before[-1])
+        for count in range(rank - 1, -1, -1):
+            one_less = before[count - 1] if count else 0.0
+            before[count] += probability * (one_less - before[count])
+    best = max(range(len(found)), key=found.__getitem__, default=None)
+    least = MIN_RANKED if rank > 1 else MIN_PROBABILITY
+    return best if best is not None and found[best] >= least else None
 
 
 def since_ns(graph: SceneGraph, since: Since) -> int:

@@ -14,6 +14,7 @@ from deworldsg_ros.client import ClientError, SceneGraph, questions
 from deworldsg_ros.client.grammar import Condition, Pattern, Rank, Since, parse
 from deworldsg_ros.client.meanings import COLOURS, colour_name, colour_shares
 from deworldsg_ros.client.questions import ask
+from deworldsg_ros.wire import messages as wire
 
 ON_TABLE, NEAR_CUP = Condition("on", "table"), Condition("near", "cup")
 RED, PURPLE, ORANGE = (Condition(own_colour=name) for name in ("red", "purple", "orange"))
@@ -198,6 +199,30 @@ def test_the_second_of_an_order_is_what_comes_after_the_first(room):
         for place, word in enumerate(("first", "second", "third", "fourth", "fifth")):
             found = [answer.item.id for answer in ask(room, ordered.format(word)).found]
             assert found == chairs[place:]
+
+
+@pytest.mark.parametrize(
+    ("cups", "found"),
+    [
+        ((0.9, 0.9, 0.44), (1, 2, 3)),  # the third one is doubtful, and there is no other
+        ((0.45, 0.9, 0.9), (2, 3, 3)),  # the nearest one is rather not there
+        ((0.1, 0.9, 0.9), (2, 3, None)),
+        ((0.9, 0.2, 0.9), (1, 3, None)),
+        ((0.9, 0.9, 0.1), (1, 2, None)),
+        ((0.1,), (1, None, None)),
+    ],
+)
+def test_objects_count_in_an_order_by_their_probability(cups, found):
+    nodes = [make_node(9, "oven", box=box_at((0.0, 0.0, 0.5), (0.6, 0.6, 0.9)))]
+    for number, probability in enumerate(cups, 1):
+        place = (float(number), 0.0, 0.5)
+        box = box_at(place, (0.1, 0.1, 0.1))
+        names = [wire.Belief("cup", 1.0)]
+        nodes.append(make_node(number, "cup", place, existence=probability, classes=names, box=box))
+    graph = SceneGraph(make_graph(nodes))
+    for word, expected in zip(("nearest", "second", "third"), found):
+        answers = ask(graph, f"{word} cup to oven").found
+        assert (answers[0].item.id if answers else None) == expected, word
 
 
 @pytest.mark.parametrize(
