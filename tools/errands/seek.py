@@ -150,14 +150,14 @@ class Seeker:
                 elif trial or not self._may_see(target):
                     continue
             looked = True
-            seen = self._seen(target, self._turn_to(target))
+            seen = self._seen(target, self.turn_to(target))
             if seen is not None and self._is_in_view(seen):
                 return seen, True
             if len(avoid) == 2 or target.id not in self.mind.graph():
                 break
         return None, looked
 
-    def _turn_to(self, target: SceneObject, frames: int = 4) -> int:
+    def turn_to(self, target: SceneObject, frames: int = 4) -> int:
         """Turn to a thing and look; returns the stamp before what is seen there."""
         way = np.array(target.position_m[:2]) - self.at[:2]
         turn = math.atan2(way[1], way[0]) - self.at[2]
@@ -227,7 +227,7 @@ class Seeker:
             if target is not None:
                 if target.first_seen_ns > since_ns and gap_m(target, self.at) > NEAR_ENOUGH_M:
                     # What is new is looked at from here, before it is gone to.
-                    self._turn_to(target, 6)
+                    self.turn_to(target, 6)
                     again = next_answer()
                     if again is None or again.id != target.id:
                         self._tell("no longer", target)
