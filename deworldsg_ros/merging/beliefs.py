@@ -203,13 +203,13 @@ def _name(record: Any, seen: Float64, is_new: bool) -> None:
 # A new node may have been overlooked: frames before that had its place in view from the same
 # viewpoint belong to this viewpoint, too.
 
-OFFSET, SCORE, LOOKS, MISSES, MOMENT = 0.2, 1.5, 1.2, 0.35, 1.2
+OFFSET, SCORE, LOOKS, MISSES, MOMENT = 0.35, 1.5, 1.2, 0.35, 1.2
 SLOPE = 1.5
 MOMENT_VIEWS = 2
 FATES = 0.4
 # The fate of a node is known from this probability on, or below one minus it after a clear miss.
 # At first, as many objects as errors are known.
-SETTLED, CLEAR_MISS, PRIOR_FATES = 0.9, 1.0, 10
+SETTLED, CLEAR_MISS, PRIOR_FATES = 0.9, 2.0, 10
 # Bounds of the score. False boxes may have high scores: above 0.5, a score says no more.
 MIN_SCORE, MAX_SCORE = 0.02, 0.5
 VIEW_RAD = math.radians(8.0)
@@ -218,7 +218,7 @@ VIEW_RATIO = 1.2
 # Viewpoints of a node that are remembered. Of more, the oldest one counts for good.
 VIEWS = 12
 # A thing that no detector fires at gets the existence of an object that was detected from two
-# viewpoints: 0.82 in a new graph. Nodes that were detected get at least three from `assume`.
+# viewpoints: 0.86 in a new graph. Nodes that were detected get at least three from `assume`.
 THING_LOOKS = 2.0
 # Frames of a viewpoint that count, two seconds of video: of more, the older half counts half. A
 # camera that stands still may see more than before, when the light changes or a person has gone.
@@ -271,12 +271,14 @@ def prior(fates: Int64) -> float:
     return OFFSET + FATES * math.log(fates[1] / fates[0])
 
 
-def settle(records: NDArray[Any], fates: Int64, slots: Int64, known: Float64) -> None:
-    """Count the nodes that have turned out to be objects, or errors, by probabilities (n,).
+def settle(
+    records: NDArray[Any], fates: Int64, slots: Int64, known: Float64, missed: Float64
+) -> None:
+    """Count the nodes that have turned out to be objects, or errors, by `probabilities` (n,).
 
     A node is an error only after a clear miss: a new node is improbable, too.
     """
-    is_error = (known < 1.0 - SETTLED) & (records["missed"][slots] > CLEAR_MISS)
+    is_error = (known < 1.0 - SETTLED) & (missed > CLEAR_MISS)
     is_new = ~records["is_settled"][slots] & ((known > SETTLED) | is_error)
     records["is_settled"][slots[is_new]] = True
     fates += np.bincount(~is_error[is_new], minlength=2)
@@ -382,12 +384,12 @@ def _view(record: Any, counts: Float64, place: int) -> tuple[float, float]:
 @kernel
 def probabilities(
     records: NDArray[Any], counts: Float64, slots: Int64, prior: float, with_misses: bool
-) -> Float64:
-    """Probability (n,) that each of n nodes is an object; the prior is that of `prior`.
+) -> tuple[Float64, Float64]:
+    """Probability (n,) that each of n nodes is an object, and M; the prior is that of `prior`.
 
     Without misses, it is that of a detector that always finds what it sees.
     """
-    result = np.empty(len(slots))
+    result, misses = np.empty(len(slots)), np.empty(len(slots))
     for index in range(len(slots)):
         record = records[slots[index]]
         found, missed, since, detecting = record.looks, record.missed, 0.0, record.looks
@@ -405,8 +407,8 @@ def probabilities(
             log_odds -= MISSES * math.log1p(missed)
             if detecting <= MOMENT_VIEWS:
                 log_odds -= MOMENT * math.log1p(since)
-        result[index] = 1.0 / (1.0 + math.exp(-SLOPE * log_odds))
-    return result
+        result[index], misses[index] = 1.0 / (1.0 + math.exp(-SLOPE * log_odds)), missed
+    return result, misses
 
 
 def merge(record: Any, other: Any, mean_world: Float64) -> None:

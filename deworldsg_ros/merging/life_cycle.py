@@ -9,7 +9,6 @@ import numpy as np
 
 from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import ABSENT
-from deworldsg_ros.merging import beliefs
 from deworldsg_ros.merging.records import NodeRecords
 from deworldsg_ros.merging.views import HALF, NOT_VISIBLE, View
 from deworldsg_ros.scene.arrays import Bool, Int64
@@ -244,8 +243,7 @@ class LifeCycle:
     def _publish(self, graph: GlobalGraph, node_ids: list[int], slots: Int64) -> None:
         """Publish the nodes that are likely to be objects, and hide the others."""
         records = self._records
-        probabilities = records.existence(slots)
-        beliefs.settle(records.rows, records.fates, slots, probabilities)
+        probabilities = records.settle(slots)
         new_ids = graph.set_existence(node_ids, probabilities, self._min_existence)
         improbable = _are_improbable(graph, slots).tolist()
         self._improbable.difference_update(node_ids)

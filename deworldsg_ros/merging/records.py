@@ -301,13 +301,22 @@ class NodeRecords:
 
     def existence(self, slots: Int64) -> Float64:
         """Probability (n,) that each of n nodes is an object."""
-        return beliefs.probabilities(self.rows, self.looks, slots, beliefs.prior(self.fates), True)
+        return self._existence(slots)[0]
+
+    def settle(self, slots: Int64) -> Float64:
+        """The same; nodes that have turned out to be objects, or errors, count for the prior."""
+        known, missed = self._existence(slots)
+        beliefs.settle(self.rows, self.fates, slots, known, missed)
+        return known
 
     def are_missed(self, slots: Int64, minimum: float) -> Bool:
         """Whether (n,) only misses make the existence of each of n nodes less than a minimum."""
-        known = self.rows, self.looks, slots, beliefs.prior(self.fates)
-        missed: Bool = beliefs.probabilities(*known, False) >= minimum
+        missed: Bool = self._existence(slots, with_misses=False)[0] >= minimum
         return missed
+
+    def _existence(self, slots: Int64, with_misses: bool = True) -> tuple[Float64, Float64]:
+        prior = beliefs.prior(self.fates)
+        return beliefs.probabilities(self.rows, self.looks, slots, prior, with_misses)
 
     def remove(self, slot: int) -> CellSets:
         """Drop everything of a node; returns its cells, as one set."""

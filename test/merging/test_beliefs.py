@@ -221,6 +221,19 @@ def test_where_new_nodes_turn_out_to_be_errors_a_new_one_is_less_probable() -> N
     assert found[0] > found[1] + 0.2
 
 
+def test_what_was_seen_once_and_missed_from_other_sides_is_an_error_that_counts() -> None:
+    records, both = records_of(2), np.arange(2)
+    for index in range(8):
+        for slot in both.tolist():
+            look(records, slot, index, 0.9 if slot or index == 0 else 0.0)
+    records.looks[:] = beliefs.first_counts() + 60 * np.array([1.0, 0.9])
+    np.testing.assert_array_equal(records.settle(both), records.existence(both))
+    first = beliefs.first_fates().tolist()
+    assert records.fates.tolist() == [first[0] + 1, first[1] + 1]
+    records.settle(both)  # each counts once
+    assert sum(records.fates) == sum(first) + 2
+
+
 def test_a_viewpoint_counts_once_however_long_it_lasts_and_however_often_it_returns() -> None:
     records = records_of(2)
     for position in (0, 1, 2):
