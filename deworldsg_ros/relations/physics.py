@@ -318,6 +318,11 @@ class PairInputs:
         return _inputs(features, *known, self._kinds, self._fixed)
 
 
+# Where the model was trained, few names were surer than this. It does not know what surer ones are,
+# as of a source that does not contradict itself (`merging.beliefs.doubt`).
+LEAST_ENTROPY_NATS = 0.8
+
+
 @kernel
 def _inputs(
     features: Float64,
@@ -357,7 +362,8 @@ def _inputs(
             result[row, start + width + kind] = of_nodes[b, kind]
         last = result[row, start + 2 * width :]
         last[0], last[1], last[2] = there, back, same
-        last[3], last[4] = max(entropies[a], 0.0), max(entropies[b], 0.0)
+        last[3] = max(entropies[a], LEAST_ENTROPY_NATS)
+        last[4] = max(entropies[b], LEAST_ENTROPY_NATS)
         last[5], last[6] = math.log(observations[a]), math.log(observations[b])
     return result
 

@@ -142,7 +142,7 @@ def test_inputs(classes: tuple[str, ...], count: int) -> None:
             sum(p[i] * q[j] for i, j in np.argwhere(fixed)),
             sum(q[i] * p[j] for i, j in np.argwhere(fixed)),
             sum(p * q),
-            *entropy_nats(np.array([p, q])),
+            *np.maximum(entropy_nats(np.array([p, q])), physics.LEAST_ENTROPY_NATS),
             *np.log(observations[[a, b]]),
         ]
         np.testing.assert_allclose(made[row], expected, atol=1e-12)
