@@ -235,7 +235,7 @@ def ask(graph: SceneGraph, question: str) -> Answers:
     if pattern.kind == "colour":
         answers = answers[:1]
     if not answers:
-        notes.insert(0, f"nothing fulfils this with {MIN_PROBABILITY:.0%} or more")
+        notes.insert(0, f"nothing fulfils this with {_least(pattern.rank):.0%} or more")
     chances = [answer.probability for answer in answers]
     return Answers(
         question,
@@ -337,31 +337,35 @@ def _ranked(graph: SceneGraph, rank: Rank, answers: list[Answer]) -> tuple[list[
     compared = [(value(answer.item), answer) for answer in known]
     compared.sort(key=lambda pair: pair[0][0], reverse=most_first)
     found = [replace(one, evidence=f"{one.evidence}; {text}") for (_, text), one in compared]
-    at = _place_of(rank.place, [one.probability for one in found])
-    if at is None:
-        return [], []
-    later = [one for one in found[at + 1 :] if one.probability >= 0.5]
     doubtful = sum(answer.probability < 0.5 for answer in answers)
     how = "not compared" if len(known) < len(answers) else "counted by probability"
     notes = [f"{counted(doubtful, 'doubtful object')} {how}"] if doubtful else []
-    return [found[at], *later], notes
+    at = _place_of(rank, [one.probability for one in found])
+    if at is None:
+        return [], notes
+    return [found[at], *(one for one in found[at + 1 :] if one.probability >= 0.5)], notes
 
 
-def _place_of(rank: int, probabilities: Sequence[float]) -> int | None:
-    """Which of several objects in an order is most probably the one of a rank, from 1 on.
+def _least(rank: Rank | None) -> float:
+    """An answer is at least so probable."""
+    return MIN_RANKED if rank is not None and rank.place > 1 else MIN_PROBABILITY
+
+
+def _place_of(rank: Rank, probabilities: Sequence[float]) -> int | None:
+    """Which of several objects in an order is most probably the one of a rank.
 
     Each counts by its probability, independent of the others. None = nothing is probable enough.
     """
-    before = [1.0] + [0.0] * (rank - 1)  # that so many of those before an object are there
+    # The probability that 0, 1, 2, … objects before this one are really there.
+    before = [1.0] + [0.0] * (rank.place - 1)
     found = []
     for probability in probabilities:
         found.append(probability * before[-1])
-        for count in range(rank - 1, -1, -1):
+        for count in range(rank.place - 1, -1, -1):
             one_less = before[count - 1] if count else 0.0
             before[count] += probability * (one_less - before[count])
     best = max(range(len(found)), key=found.__getitem__, default=None)
-    least = MIN_RANKED if rank > 1 else MIN_PROBABILITY
-    return best if best is not None and found[best] >= least else None
+    return best if best is not None and found[best] >= _least(rank) else None
 
 
 def since_ns(graph: SceneGraph, since: Since) -> int:

@@ -223,6 +223,11 @@ def test_objects_count_in_an_order_by_their_probability(cups, found):
     for word, expected in zip(("nearest", "second", "third"), found):
         answers = ask(graph, f"{word} cup to oven").found
         assert (answers[0].item.id if answers else None) == expected, word
+    if expected is None:
+        notes = ask(graph, "third cup to oven").notes
+        doubtful = sum(p < 0.5 for p in cups)
+        assert notes[0] == "nothing fulfils this with 20% or more"
+        assert notes[1].startswith(f"{doubtful} doubtful object")
 
 
 @pytest.mark.parametrize(
