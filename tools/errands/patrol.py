@@ -42,8 +42,7 @@ def patrol(seeker: Seeker) -> None:
             continue
         while items:
             seeker.turn_to(items[0])
-            yaws = [_yaw_to(seeker, item) for item in items]
-            items = [item for item, yaw in zip(items[1:], yaws[1:]) if abs(yaw) > BESIDE_RAD]
+            items = [item for item in items[1:] if abs(seeker.turn_of(item)) > BESIDE_RAD]
 
 
 def _next_place(
@@ -76,10 +75,3 @@ def _next_place(
     if path is None:
         return None
     return path, [item for item, is_seen in zip(doubts, seen[best]) if is_seen]
-
-
-def _yaw_to(seeker: Seeker, item: SceneObject) -> float:
-    """By how much an object is beside where the robot looks, radian."""
-    x, y, yaw = seeker.at
-    turn = math.atan2(item.position_m[1] - y, item.position_m[0] - x) - yaw
-    return (turn + math.pi) % (2 * math.pi) - math.pi

@@ -159,9 +159,13 @@ class Seeker:
 
     def turn_to(self, target: SceneObject, frames: int = 4) -> int:
         """Turn to a thing and look; returns the stamp before what is seen there."""
-        way = np.array(target.position_m[:2]) - self.at[:2]
-        turn = math.atan2(way[1], way[0]) - self.at[2]
-        return self._look_at(turn + float(self.robot.believed[2]), frames)
+        return self._look_at(self.turn_of(target) + float(self.robot.believed[2]), frames)
+
+    def turn_of(self, target: SceneObject) -> float:
+        """By how much a thing is beside where the robot looks, radian, from -pi to pi."""
+        x, y, yaw = self.at
+        ahead = math.atan2(target.position_m[1] - y, target.position_m[0] - x)
+        return math.remainder(ahead - yaw, math.tau)
 
     def _may_see(self, item: SceneObject) -> bool:
         """Whether a thing is near, and nothing tall before it."""
