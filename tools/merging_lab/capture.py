@@ -51,7 +51,7 @@ from deworldsg_ros.recordings.folders.sequence import read_instances
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.recordings.source import Source
 from deworldsg_ros.scene.arrays import Float64, Int64, UInt16
-from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
+from deworldsg_ros.scene.camera import AXES, RgbdFrame, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.vocabulary import COCO_CLASSES, TABLES
@@ -312,15 +312,15 @@ def _without_bearers(
     """The points without what bears the object, and without the tables that it is pushed under."""
     if world_up == "auto":
         return points
-    axis, sign = "xyz".find(world_up[-1]), -1.0 if world_up[0] == "-" else 1.0
-    heights = sign * points[:, axis]
-    bottom, _ = sorted(sign * np.array([item.low[axis], item.high[axis]]))
+    up = np.array(AXES[world_up])
+    heights, level = points @ up, up == 0.0
+    bottom = min(item.low @ up, item.high @ up)
     kept = heights > bottom + BEARER_M
     for other in objects:
-        _, top = sorted(sign * np.array([other.low[axis], other.high[axis]]))
+        top = max(other.low @ up, other.high @ up)
         if other is not item and other.names[0] in TABLES and bottom < top - TABLE_M:
-            inside = (points > other.low) & (points < other.high)
-            kept &= ~(np.delete(inside, axis, axis=1).all(axis=1) & (heights > top - TABLE_M))
+            inside = ((points > other.low) & (points < other.high))[:, level].all(axis=1)
+            kept &= ~(inside & (heights > top - TABLE_M))
     return points[kept]
 
 
