@@ -246,26 +246,26 @@ def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
 
 
 def relation_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
-    """Relations, most probable first."""
-    table = Table(title=_title("relation", len(graph.edges), most))
+    """Relations, those first that are most probably true as they are said."""
+    found = SceneGraph(graph).relations()
+    table = Table(
+        title=_title("relation", len(found), most),
+        caption="p: it holds, and both are what they are called",
+    )
     for name in ("subject", "predicate", "object"):
         table.add_column(name, no_wrap=True)
     table.add_column("p", justify="right")
     table.add_column("provenance", no_wrap=True)
     table.add_column("seen", justify="right")
-    names = {node.id: _name(node.label, node.id) for node in graph.nodes}
-    edges = sorted(
-        graph.edges,
-        key=lambda edge: (-edge.probability, -edge.observations, edge.subject, edge.object),
-    )
-    for edge in edges[:most]:
+    found.sort(key=lambda item: (-item.triplet_probability, -item.observations))
+    for item in found[:most]:
         table.add_row(
-            names.get(edge.subject, _name("?", edge.subject)),
-            Text(visible(edge.predicate), "bold"),
-            names.get(edge.object, _name("?", edge.object)),
-            _percent(edge.probability),
-            Text(edge.provenance, PROVENANCE_STYLES[edge.provenance]),
-            str(edge.observations),
+            _name(item.subject.label, item.subject.id),
+            Text(visible(item.predicate), "bold"),
+            _name(item.object.label, item.object.id),
+            _percent(item.triplet_probability),
+            Text(item.provenance, PROVENANCE_STYLES[item.provenance]),
+            str(item.observations),
         )
     return table
 

@@ -82,6 +82,8 @@ class GraphTools:
     ) -> dict[str, Any]:
         """List the relations between objects, e.g. every cup (subject) on (predicate) a table.
 
+        Those first that are most probably true as their `text` says them: `triplet_probability`.
+
         Args:
             subject: class or id of the subject; empty = any.
             predicate: e.g. "on", "in", "near"; empty = any.
@@ -90,6 +92,7 @@ class GraphTools:
         """
         graph = self._graph()
         found = graph.relations(_which(subject), predicate or None, _which(object))
+        found.sort(key=lambda relation: -relation.triplet_probability)
         return {
             **_about(graph),
             "count": len(found),

@@ -222,7 +222,7 @@ class Relation:
     Attributes:
         subject, object: the two objects.
         predicate: as asked, or the most probable one.
-        probability: that the predicate holds, given that both objects exist.
+        probability: that the predicate holds, given that both objects exist; whatever they are.
         predicates: probabilities of the predicates that the message lists, the best first.
         other_predicates: probability of all predicates that it does not list.
         provenance: ``visual`` (frames), ``prior`` (world model) or ``fused`` (both).
@@ -252,9 +252,18 @@ class Relation:
         return min(max(1.0 - known, 0.0), 1.0)
 
     @property
+    def triplet_probability(self) -> float:
+        """Probability that `text` is true: it holds, and both exist and are what they are called.
+
+        The product of the probabilities of relation, subject and object, as of the triplets of
+        scene graphs.
+        """
+        return self.probability * self.subject.probability * self.object.probability
+
+    @property
     def is_sure(self) -> bool:
-        """Whether `probability` is at least `SURE`."""
-        return self.probability >= SURE
+        """Whether `triplet_probability` is at least `SURE`."""
+        return self.triplet_probability >= SURE
 
     @property
     def text(self) -> str:
@@ -280,6 +289,7 @@ class Relation:
             "predicate": self.predicate,
             "object": {"id": self.object.id, "label": self.object.label},
             "probability": round(self.probability, 3),
+            "triplet_probability": round(self.triplet_probability, 3),
             "sure": self.is_sure,
             "predicates": {item.label: round(item.probability, 3) for item in self.predicates},
             "other_predicates": round(self.other_predicates, 3),

@@ -154,6 +154,24 @@ def test_objects_are_frozen_and_tell_everything(small):
     assert not doubtful.is_sure
 
 
+def test_a_triplet_is_as_probable_as_its_relation_and_its_ends_together(small):
+    (near,) = small.relations("chair", "near", "table")
+    ends = near.subject.probability * near.object.probability
+    assert near.triplet_probability == pytest.approx(0.8 * ends)
+    assert near.to_dict()["triplet_probability"] == pytest.approx(0.8 * ends, abs=1e-3)
+    # The relation is as probable as before, and the sentence is not.
+    chair, table = (small[i].state for i in (3, 2))
+    doubtful = msgspec.structs.replace(chair, existence=0.3)
+    (same,) = SceneGraph(make_graph([doubtful, table], small.message.edges)).relations("chair")
+    assert same.probability == 0.8 and same.triplet_probability < 0.3
+    (on,) = SceneGraph(make_graph([chair, table], [make_edge(3, 2, "on", 0.95)])).relations()
+    assert on.is_sure and not same.is_sure
+    # Without a name, it is enough that the thing exists.
+    thing = msgspec.structs.replace(chair, named=False, label="object", existence=0.9)
+    (of_thing,) = SceneGraph(make_graph([thing, table], small.message.edges)).relations(3)
+    assert of_thing.triplet_probability == pytest.approx(0.8 * 0.9 * near.object.probability)
+
+
 def test_heights_follow_the_up_direction():
     node = make_node(1, "cup", (0.0, -2.0, 0.0), np.diag([0.01, 0.0003, 0.01]))
     cup = SceneGraph(make_graph([node], up=[0.0, -1.0, 0.0]))[1]

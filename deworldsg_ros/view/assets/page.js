@@ -47,8 +47,12 @@ function isDouble(edge) {
     (other.probability - edge.probability || edge.subject - edge.object) > 0;
 }
 
+// That it holds, and that both are what they are called.
+const tripletOf = edge =>
+  edge.probability * nodes.get(edge.subject).probability * nodes.get(edge.object).probability;
+
 const showsEdge = edge => !hiddenPredicates.has(edge.predicate) && !isDouble(edge) &&
-  edge.probability >= least.relation && nodes.has(edge.subject) && nodes.has(edge.object) &&
+  nodes.has(edge.subject) && nodes.has(edge.object) && tripletOf(edge) >= least.relation &&
   showsNode(nodes.get(edge.subject)) && showsNode(nodes.get(edge.object));
 const visibleNodes = () => [...nodes.values()].filter(showsNode);
 const visibleEdges = () => {
@@ -313,7 +317,7 @@ function drawArrows() {
     const curve = curveOf(edge), length = Math.max(curve.getLength(), 1e-3);
     const radius = Math.min(0.0022 * reach, 0.03 * length);
     const colour = [...rgb(head.tints[edge.predicate] ?? "#8d93a5"),
-      first === null ? 0.25 + 0.65 * edge.probability ** 2 : 1];
+      first === null ? 0.25 + 0.65 * tripletOf(edge) ** 2 : 1];
     const rings = [...Array(parts + 1).keys()].map(step => [step / parts, radius]);
     if (!edge.mutual) {
       const tip = 0.9, base = tip - Math.min(10 * radius / length, 0.3);
@@ -624,7 +628,7 @@ function relationItem(edge, id) {
   link.onclick = event => { event.preventDefault(); choose(other); };
   const ends = [edge.subject, edge.object].map(end => end === id ? name(end) : link);
   summary.append(ends[0], " ", element("b", "", head.verbs[edge.predicate]), " ", ends[1], " ",
-    element("span", "quiet", `${percent(edge.probability)}, ${SOURCES[edge.provenance]}`));
+    element("span", "quiet", `${percent(tripletOf(edge))}, ${SOURCES[edge.provenance]}`));
   const show = async () => {
     const lines = await reasonsOf(edge);
     if (more.childElementCount === 1)

@@ -86,6 +86,8 @@ def test_filters_hide_classes_relations_and_what_is_not_sure(chromium):
     graph.nodes[1] = msgspec.structs.replace(graph.nodes[1], existence=0.5)
     with shown(chromium, graph) as (_, page):
         predicates = "visibleEdges().map(edge => edge.predicate)"
+        assert page.evaluate(predicates) == []  # that the cup is beside it is below 50 %
+        page.locator("#least-relation").fill("20")
         assert page.evaluate(predicates) == ["beside"]  # near is hidden at first
         assert "cup? 2" in labels(page)
         page.locator("#predicates label", has_text="near").click()
