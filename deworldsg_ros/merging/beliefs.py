@@ -203,7 +203,7 @@ def _name(record: Any, seen: Float64, is_new: bool) -> None:
 # A new node may have been overlooked: frames before that had its place in view from the same
 # viewpoint belong to this viewpoint, too.
 
-OFFSET, SCORE, LOOKS, MISSES, MOMENT = 0.35, 1.5, 1.2, 0.35, 1.2
+OFFSET, SCORE, LOOKS, MISSES, MOMENT = 0.2, 1.5, 1.2, 0.35, 1.2
 SLOPE = 1.5
 MOMENT_VIEWS = 2
 FATES = 0.4
@@ -218,7 +218,7 @@ VIEW_RATIO = 1.2
 # Viewpoints of a node that are remembered. Of more, the oldest one counts for good.
 VIEWS = 12
 # A thing that no detector fires at gets the existence of an object that was detected from two
-# viewpoints: 0.86 in a new graph. Nodes that were detected get at least three from `assume`.
+# viewpoints: 0.82 in a new graph. Nodes that were detected get at least three from `assume`.
 THING_LOOKS = 2.0
 # Frames of a viewpoint that count, two seconds of video: of more, the older half counts half. A
 # camera that stands still may see more than before, when the light changes or a person has gone.
