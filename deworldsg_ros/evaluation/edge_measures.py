@@ -88,6 +88,8 @@ class ReferenceScene:
         relations: (subject id, object id, predicate name) of every true relation.
         exact: True if boxes and centroids come from the ground truth of a rendered room, False if
             they come from annotated surface points.
+        unclear: (id, id) of the pairs about which two people may disagree, in both orders. Their
+            edges and relations are neither right nor wrong.
     """
 
     ids: list[int]
@@ -97,6 +99,7 @@ class ReferenceScene:
     centroids: Float64
     relations: frozenset[tuple[int, int, str]]
     exact: bool
+    unclear: frozenset[tuple[int, int]] = frozenset()
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -125,6 +128,9 @@ def read_reference(annotations: Annotations, scan: str, points: ScanPoints) -> R
             centroids.reshape(-1, 3),
             frozenset((int(s), int(o), str(name)) for s, o, _, name in content["relationships"]),
             exact=True,
+            unclear=frozenset(
+                pair for a, b in content.get("unclear", ()) for pair in ((int(a), int(b)), (b, a))
+            ),
         )
     except (KeyError, TypeError, ValueError) as error:
         raise RecordingError(
@@ -290,13 +296,15 @@ class EdgeScores:
 def judge_edges(
     edges: Iterable[EdgeView], ends: Mapping[int, EdgeEnd], reference: ReferenceScene
 ) -> list[JudgedEdge]:
-    """Each edge beside the annotation; `ends` has the ends by node id."""
+    """Each edge of a clear pair beside the annotation; `ends` has the ends by node id."""
     truth = _predicates_by_pair(reference)
     judged = []
     for edge in edges:
         subject, object_ = (
             ends.get(node, EdgeEnd(node, "", 0, None)) for node in (edge.subject, edge.object)
         )
+        if (subject.object, object_.object) in reference.unclear:
+            continue
         judged.append(
             JudgedEdge(
                 subject,
@@ -316,6 +324,8 @@ def judge_relations(
 ) -> list[JudgedEdge]:
     """Each relation between objects that can be detected, with the edge that states it best.
 
+    Relations of unclear pairs are left out.
+
     Args:
         judged: the edges of the graph.
         ends: by object id, the end at the main node of the object; others have no node.
@@ -331,6 +341,8 @@ def judge_relations(
     relations = []
     for subject, object_, predicate in sorted(reference.relations):
         if subject not in labels or object_ not in labels:
+            continue
+        if (subject, object_) in reference.unclear:
             continue
         stated = best.get((subject, predicate, object_))
         relations.append(

@@ -1,7 +1,9 @@
 """Measures beside recall, on graphs whose faults are counted by hand."""
 
 import csv
+import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -109,6 +111,11 @@ def test_reference_from_surface_points_or_ground_truth(tmp_path):
     found = read_reference(annotations, "a", annotations.points("a"))
     assert (found.ids, found.exact) == ([1, 2, 3], True)
     assert (1, 2, "near") in found.relations
+    assert not found.unclear
+    path = tmp_path / "data/a/gt.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "unclear": [[1, 2]]}))
+    found = read_reference(annotations, "a", annotations.points("a"))
+    assert found.unclear == {(1, 2), (2, 1)}
     (tmp_path / "data/a/gt.json").write_text('{"objects": [{}]}')
     with pytest.raises(RecordingError, match=r"gt\.json"):
         read_reference(annotations, "a", annotations.points("a"))
@@ -180,6 +187,13 @@ def test_edges():
         assert twice.relations == 2 * one.relations and twice.found == 2 * one.found
         assert twice.sure_wrong == 2 * one.sure_wrong
         assert twice.calibration_error == pytest.approx(one.calibration_error, nan_ok=True)
+
+
+def test_edges_of_unclear_pairs_are_neither_right_nor_wrong():
+    unclear = replace(HALL, unclear=frozenset({(10, 20), (20, 10)}))
+    on = measure_views(NODES, EDGES, unclear).edge_scores()["on"]
+    # Without the two edges and the relation of cup and table; those of no object count as before.
+    assert (on.relations, on.found, on.said, on.right, on.unmatched) == (1, 0, 1, 0, 2)
 
 
 def test_the_edge_list_has_the_worst_edges_first(tmp_path):
