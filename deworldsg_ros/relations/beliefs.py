@@ -46,6 +46,7 @@ from deworldsg_ros.relations.physics import (
 )
 from deworldsg_ros.relations.rules import settle, take_in
 from deworldsg_ros.relations.states import (
+    ABOVE_STATES,
     NEAR,
     NONE,
     RELATIONS_OF_STATE,
@@ -273,6 +274,10 @@ class RobustBeliefs:
         geometry[unknown] = 0.0
         votes, near = vote_logits(counts, pairs.rows["shown"][rows], model.votes)
         independent = unknown if self._own_head else np.ones_like(unknown)
+        if self._own_head:
+            above = votes[:, ABOVE_STATES]
+            silent = np.where(table.rated_above(rows), above, np.maximum(above, 0.0))
+            votes[:, ABOVE_STATES] = silent
         logits = believed_logits(model, geometry, votes, independent)
         # Whatever the votes: what is measured to be false is not so.
         wrong = table.contradicted(rows)

@@ -30,7 +30,15 @@ from deworldsg_ros.relations.physics import PairInputs, PhysicsModel
 from deworldsg_ros.relations.rules import Scene
 from deworldsg_ros.relations.states import BELIEF, NEAR, NONE, SHAPE
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
-from deworldsg_ros.scene.vocabulary import CARRY_ON_TOP, TABLE_SEATS, TABLES_WITH_SEATS
+from deworldsg_ros.scene.vocabulary import (
+    CARRY_ON_TOP,
+    FURNITURE,
+    OVERHEAD,
+    SEATS,
+    TABLE_SEATS,
+    TABLES,
+    TABLES_WITH_SEATS,
+)
 
 # Logit of every relation of a pair that is out of reach. The simulated rooms have none there.
 APART_LOGIT = -12.0
@@ -112,6 +120,8 @@ class PairTable:
         names = self._known_names = self._graph.vocabulary.classes
         self._inputs = PairInputs(names)
         self._on_top = np.array([name in CARRY_ON_TOP for name in names], np.bool_)
+        sets = OVERHEAD, FURNITURE - SEATS, TABLES, SEATS
+        self._over = np.array([[name in classes for name in names] for classes in sets], np.bool_)
         seating = [[name in TABLES_WITH_SEATS, name in TABLE_SEATS] for name in names]
         self._seating = np.array(seating, np.float64)
 
@@ -160,6 +170,15 @@ class PairTable:
         apart = self.beliefs["judged"][rows, None, None] & (np.arange(NONE) != NEAR)
         both = np.stack([there, back], axis=1)
         return np.asarray(np.where(near[:, None, None], both, apart))
+
+    def rated_above(self, rows: Int64) -> Bool:
+        """Whether the embedded relation head rates "above" for the classes of pairs, (m, 2).
+
+        By which end would be above. Where it does not, as for seats, its silence says nothing.
+        """
+        classes = self.classes(rows)
+        overhead, below, tables, seats = self._over[:, classes]
+        return np.asarray((overhead & below[:, ::-1]) | (tables & ~seats[:, ::-1]))
 
     def classes(self, rows: Int64) -> Int64:
         """The most probable class (k, 2) of both nodes of pairs."""

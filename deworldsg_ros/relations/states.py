@@ -42,6 +42,8 @@ RELATIONS_OF_STATE: Int64 = np.array(
     ],
     np.int64,
 )
+# States in which the first or the second one is above.
+ABOVE_STATES = [1 + 2 * DIRECTED.index(ABOVE), 2 + 2 * DIRECTED.index(ABOVE)]
 
 
 # --- What is kept of each published node, and of each pair of them.

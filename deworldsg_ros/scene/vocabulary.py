@@ -49,6 +49,23 @@ KINDS: tuple[frozenset[str], ...] = (
     TABLES, SEATS, STORAGE, CONTAINERS, PLANTS, ON_WALLS, SCREENS, SOFT, FLAT, BEDS,
 )  # fmt: skip
 
+# Classes that are furniture even if only a small part is visible.
+FURNITURE = (
+    TABLES
+    | SEATS
+    | frozenset(
+        [
+            "bathtub", "bed", "bookshelf", "cabinet", "curtain", "door", "oven", "refridgerator",
+            "refrigerator", "screen", "shelf", "sink", "stand", "toilet", "tv", "window",
+        ]
+    )
+)  # fmt: skip
+# Classes of objects that hang on walls.
+HUNG = frozenset({"board", "clock", "picture", "sign"})
+# Of these, what the embedded relation head says to be above furniture. People move seats, so a seat
+# is neither above nor under anything there.
+OVERHEAD = (FURNITURE | HUNG) - SEATS - {"sink"}
+
 # Tables, appliances and flat things carry on their tops. Seats and shelves, beds and containers
 # carry below their highest point. So may what is not known here.
 CARRY_ON_TOP = TABLES | FLAT | {"oven", "refridgerator", "refrigerator", "microwave", "toaster"}

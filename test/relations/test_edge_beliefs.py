@@ -184,6 +184,22 @@ def test_votes_of_another_relation_head_count_more() -> None:
     assert of("egtr") > of("geometric")
 
 
+@pytest.mark.parametrize("label, rated", [("chair", False), ("bed", True)])
+def test_silence_on_what_the_relation_head_does_not_rate_says_nothing(
+    label: str, rated: bool
+) -> None:
+    things = {
+        "low": thing(label, 0, 0, 0, 0.9, 0.9, 0.5),
+        "tv": thing("tv", 0, 0, 1.0, 0.8, 0.3, 0.5),
+    }
+    builder, ids = room(things, config())
+    before = beliefs_of(builder, config())[ids["tv"], ids["low"]][PREDICATES.index("above")]
+    vote(builder, ids["tv"], ids["low"], None, 20)
+    after = beliefs_of(builder, config())[ids["tv"], ids["low"]][PREDICATES.index("above")]
+    assert before > 0.5
+    assert after < before - 0.1 if rated else after == pytest.approx(before, abs=0.05)
+
+
 def test_unconfirmed_nodes_have_no_edges_and_take_no_part() -> None:
     """A phantom under the cup would otherwise carry half of it."""
     phantom = {**DESK, "phantom": thing("book", 0.3, 0.1, 0.71, 0.3, 0.3, 0.03)}

@@ -12,28 +12,24 @@ from deworldsg_ros.perception.protocols import SegmentedObjects
 from deworldsg_ros.scene.arrays import Bool, Float64
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import Relations
-from deworldsg_ros.scene.vocabulary import CONTAINERS, FIXED_TO, PLANTS, SEATS, TABLES
+from deworldsg_ros.scene.vocabulary import (
+    CONTAINERS,
+    FIXED_TO,
+    FURNITURE,
+    HUNG,
+    OVERHEAD,
+    PLANTS,
+    SEATS,
+    TABLES,
+)
 
 # --- Classes of objects whose relations the layout alone cannot show.
 
-# Classes that are furniture even if only a small part is visible.
-FURNITURE = (
-    TABLES
-    | SEATS
-    | frozenset(
-        [
-            "bathtub", "bed", "bookshelf", "cabinet", "curtain", "door", "oven", "refridgerator",
-            "refrigerator", "screen", "shelf", "sink", "stand", "toilet", "tv", "window",
-        ]
-    )
-)  # fmt: skip
 # Classes that stand on the floor, and on nothing else that is furniture.
 FLOOR_STANDING = (TABLES - {"counter"}) | SEATS | frozenset({"bed", "bathtub", "toilet"})
 BUILT_IN = frozenset({"sink", "window"})
 FLOORS = frozenset({"floor"})
 WALLS = frozenset({"wall"})
-# Classes of objects that hang on walls.
-HUNG = frozenset({"board", "clock", "picture", "sign"})
 
 
 # --- Logits of predicates for each ordered pair of objects, from their metric layout.
@@ -316,7 +312,7 @@ def _above(pairs: _Pairs) -> Float64:
         ABOVE_MIN_CLEARANCE_M.at_least(layout.clearance_m),
         ABOVE_MAX_CLEARANCE_M.at_most(layout.clearance_m),
         ABOVE_CONTACT_M.at_least(layout.contact_m),
-        _flag(pairs.both((FURNITURE | HUNG) - SEATS - {"sink"}, FURNITURE - SEATS)),
+        _flag(pairs.both(OVERHEAD, FURNITURE - SEATS)),
     )
 
 
