@@ -276,8 +276,9 @@ class RobustBeliefs:
         independent = unknown if self._own_head else np.ones_like(unknown)
         if self._own_head:
             above = votes[:, ABOVE_STATES]
-            silent = np.where(table.rated_above(rows), above, np.maximum(above, 0.0))
-            votes[:, ABOVE_STATES] = silent
+            votes[:, ABOVE_STATES] = np.where(
+                table.rated_above(rows), above, np.maximum(above, 0.0)
+            )
         logits = believed_logits(model, geometry, votes, independent)
         # Whatever the votes: what is measured to be false is not so.
         wrong = table.contradicted(rows)
