@@ -105,7 +105,7 @@ def explain_relation(relation: Relation, seen: SeenFrames | None = None) -> Expl
     geometry = relation_geometry(relation)
     lines = [
         f"holds with {relation.probability:.0%} ({odds_of(relation.probability)})",
-        f"and both are what they are called with {relation.triplet_probability:.0%}"
+        f"holds, and both are what they are called: {relation.triplet_probability:.0%}"
         + ("" if relation.is_sure else ": not sure"),
         f"evidence: {relation.evidence}",
         *_frame_lines(seen),
