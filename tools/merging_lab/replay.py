@@ -27,6 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.client.objects import relation_of
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.edge_measures import Calibrated, calibration_error, reliability
 from deworldsg_ros.evaluation.graph_measures import (
@@ -393,14 +394,16 @@ def marked_lines(graph: wire.SceneGraphMessage, marks: Marks, edges: Path | None
         if item.probability >= EDGE_PROBABILITY
     ]
     count = sum(is_right for is_right, _, _ in judged)
-    sure = {node.id: node for node in SceneGraph(graph)}
-    whole = [
+    items = SceneGraph(graph)
+    sentences = [
         is_right
         for is_right, edge, item in judged
-        if item.probability * sure[edge.subject].probability * sure[edge.object].probability
+        if relation_of(
+            edge, items[edge.subject], items[edge.object], item.label
+        ).triplet_probability
         >= EDGE_PROBABILITY
     ]
-    lines.append(f"    with the names {len(whole)} edges {sum(whole)} right")
+    lines.append(f"    of {len(sentences)} sentences {sum(sentences)} right")
     lines.append(f"    of {len(judged)} edges {count} right; the others:")
     lines += [
         f"      {said[edge.subject]} {item.label} {said[edge.object]} {item.probability:.2f}"
