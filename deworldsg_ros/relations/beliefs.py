@@ -34,10 +34,12 @@ from deworldsg_ros.relations.paper import (
     bounded_logits,
     edge_state,
     entropy_nats,
-    fuse_distributions,
+    fuse_prior,
     visual_distribution,
 )
 from deworldsg_ros.relations.physics import (
+    UNIT,
+    VoteRate,
     believed_logits,
     floor_odds,
     load_physics_model,
@@ -75,9 +77,6 @@ JUDGED_A_CALL = 12
 MIN_RELATED = 0.5
 # Logit of a state that the measured geometry contradicts.
 CONTRADICTED_LOGIT = -60.0
-# Predictions are summed as whole numbers of this. Such sums are exact: taking a prediction back
-# leaves no trace, and the order does not matter.
-UNIT = 2.0**-40
 
 ClassPair = tuple[int, int]
 
@@ -221,6 +220,7 @@ class RobustBeliefs:
         self._graph = graph
         self._table = table
         self._model = load_physics_model()
+        self._rate = VoteRate()
         self._names = PredicateNames.of(graph.vocabulary.predicates)
         # Rows of the pairs into which a prior may enter, by class pair; some do not any more.
         self._by_classes: dict[ClassPair, set[int]] = {}
@@ -235,6 +235,8 @@ class RobustBeliefs:
         """
         table = self._table
         rows = np.array(sorted(table.changed_rows), np.int64)
+        if not self._own_head and self._learn_rate(rows):
+            rows = joined(rows, np.flatnonzero(table.beliefs["known"]))
         known = table.beliefs["known"][rows]
         changed = self._settle(rows[known])
         again = set().union(*map(self._open_rows, prior.changed))
@@ -243,6 +245,14 @@ class RobustBeliefs:
         table.changed_slots.clear()
         prior.changed.clear()
         return self._beliefs(changed, rows[~known], prior)
+
+    def _learn_rate(self, rows: Int64) -> bool:
+        """Learn how often the source speaks; whether its votes are worth more or less now."""
+        pairs, beliefs = self._graph.pairs, self._table.beliefs.take(rows)
+        counts, _ = relation_counts(pairs.counts(rows), self._names.relation_of)
+        logits = self._model.source_weights[0] * beliefs["state_logits"].astype(np.float64)
+        judged = beliefs["known"] & beliefs["judged"]
+        return self._rate.follow(rows, logits, judged, counts, pairs.rows["shown"][rows])
 
     def _settle(self, rows: Int64) -> Int64:
         """Relations around pairs that were judged; returns the rows whose relations changed."""
@@ -272,7 +282,8 @@ class RobustBeliefs:
         geometry = beliefs["state_logits"][rows].astype(np.float64)
         unknown = ~beliefs["judged"][rows]
         geometry[unknown] = 0.0
-        votes, near = vote_logits(counts, pairs.rows["shown"][rows], model.votes)
+        frames = pairs.rows["shown"][rows]
+        votes, near = vote_logits(self._rate.worthy(counts, frames), frames, model.votes)
         independent = unknown if self._own_head else np.ones_like(unknown)
         if self._own_head:
             above = votes[:, ABOVE_STATES]
@@ -395,31 +406,6 @@ class RobustBeliefs:
 def _with_none(contradicted: Bool) -> Bool:
     """Of which relations the geometry contradicts, (..., NONE + 1): never "none"."""
     return np.concatenate([contradicted, np.zeros_like(contradicted[..., :1])], axis=-1)
-
-
-def fuse_prior(
-    probabilities: Float64, priors: Float64, has_prior: Bool, alpha: float, threshold_nats: float
-) -> tuple[Float64, Bool]:
-    """Eq. 10 for pairs that are related with some probability.
-
-    The prior says by what a pair is related, not whether. It enters where the distribution over
-    predicates, given that one holds, has an entropy above the threshold.
-
-    Args:
-        probabilities: (m, R), row sums at most 1.
-        priors: (m, R) distributions, and
-        has_prior: (m,) bool.
-        alpha: weight of Eq. 10.
-        threshold_nats: entropy.
-
-    Returns:
-        (m, R) with the same row sums, and (m,) bool: the prior entered.
-    """
-    related = probabilities.sum(axis=1)
-    given = probabilities / np.maximum(related, 1e-300)[:, None]
-    active = has_prior & (entropy_nats(given) > threshold_nats) & (related > 0) & (alpha > 0)
-    fused = fuse_distributions(given, priors, np.where(active, alpha, 0.0))
-    return np.where(active[:, None], related[:, None] * fused, probabilities), active
 
 
 # --- The beliefs of the edges of the global graph: evidence in, messages out.

@@ -276,6 +276,31 @@ def fuse_distributions(visual: Float64, prior: Float64, alpha: Float64) -> Float
     return fused
 
 
+def fuse_prior(
+    probabilities: Float64, priors: Float64, has_prior: Bool, alpha: float, threshold_nats: float
+) -> tuple[Float64, Bool]:
+    """Eq. 10 for pairs that are related with some probability (beyond the paper).
+
+    The prior says by what a pair is related, not whether. It enters where the distribution over
+    predicates, given that one holds, has an entropy above the threshold.
+
+    Args:
+        probabilities: (m, R), row sums at most 1.
+        priors: (m, R) distributions, and
+        has_prior: (m,) bool.
+        alpha: weight of Eq. 10.
+        threshold_nats: entropy.
+
+    Returns:
+        (m, R) with the same row sums, and (m,) bool: the prior entered.
+    """
+    related = probabilities.sum(axis=1)
+    given = probabilities / np.maximum(related, 1e-300)[:, None]
+    active = has_prior & (entropy_nats(given) > threshold_nats) & (related > 0) & (alpha > 0)
+    fused = fuse_distributions(given, priors, np.where(active, alpha, 0.0))
+    return np.where(active[:, None], related[:, None] * fused, probabilities), active
+
+
 @dataclass(frozen=True)
 class FusedEdges:
     """Beliefs of E directed edges.

@@ -20,10 +20,9 @@ from deworldsg_ros.relations.beliefs import (
     MAX_DISTANCE_M,
     PredictedPrior,
     RobustBeliefs,
-    fuse_prior,
 )
 from deworldsg_ros.relations.pairs import PairTable
-from deworldsg_ros.relations.paper import Prior, entropy_nats, fuse_distributions
+from deworldsg_ros.relations.paper import Prior, entropy_nats, fuse_distributions, fuse_prior
 from deworldsg_ros.relations.physics import load_physics_model
 from deworldsg_ros.relations.states import DECIMALS, MIN_PROBABILITY
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations
@@ -198,6 +197,30 @@ def test_silence_on_what_the_relation_head_does_not_rate_says_nothing(
     after = beliefs_of(builder, config())[ids["tv"], ids["low"]][PREDICATES.index("above")]
     assert before > 0.5
     assert after < before - 0.1 if rated else after == pytest.approx(before, abs=0.05)
+
+
+def test_a_source_that_says_little_denies_less() -> None:
+    """Of a cup that is mentioned in 1 of 20 frames, by how often others are mentioned."""
+    cups = {str(x): thing("cup", x / 8 - 0.6, 0, 0.74, 0.08, 0.08, 0.1) for x in range(10)}
+
+    def of(frames: int) -> GraphBuilder:
+        builder, ids = room({"table": table(0, 0), **cups}, config("egtr"))
+        for x in range(10):
+            vote(builder, ids[str(x)], ids["table"], "on", frames if x else 1)
+            vote(builder, ids[str(x)], ids["table"], None, 20 - (frames if x else 1))
+            builder.full()
+        return builder
+
+    rare, often = of(4), of(18)
+    (table_id, cup_id), on = sorted(rare.graph.nodes.slot_of)[:2], PREDICATES.index("on")
+    kept, denied = (
+        float(beliefs_of(builder, config("egtr"))[cup_id, table_id][on])
+        for builder in (rare, often)
+    )
+    assert kept > denied + 0.1
+    # What was learned at the end counts for pairs that were judged before.
+    fresh = GraphBuilder(config("egtr"), VOCABULARY, "map", rare.graph, rare.prior)
+    assert rare.full().edges == fresh.full().edges
 
 
 def test_unconfirmed_nodes_have_no_edges_and_take_no_part() -> None:

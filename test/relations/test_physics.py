@@ -199,6 +199,45 @@ def test_the_evidence_is_that_of_the_formula(seed: int, count: int) -> None:
         assert near[row] == pytest.approx(expected, abs=1e-12)
 
 
+def told(rate: physics.VoteRate, rows: list[int], said: float, sure: bool = True) -> bool:
+    """Let pairs, seen in 20 frames each, have votes for "on" in a fraction of them."""
+    logits, counts = np.full((len(rows), STATE_COUNT), -8.0), np.zeros((len(rows), 2, NONE))
+    logits[:, int(sure)] = 0.0
+    counts[:, 0, ON] = 20 * said
+    judged, frames = np.ones(len(rows), np.bool_), np.full(len(rows), 20)
+    return rate.follow(np.array(rows, np.int64), logits, judged, counts, frames)
+
+
+def test_votes_of_a_source_that_leaves_much_out_are_worth_more() -> None:
+    rate = physics.VoteRate()
+    assert told(rate, list(range(40)), said=0.2) and rate.worth == 2.5
+    counts, frames = np.zeros((3, 2, NONE)), np.array([20, 20, 20])
+    counts[:, 0, ON] = 0, 4, 18
+    # Silence stays silence, and no vote is worth less than before.
+    assert rate.worthy(counts, frames)[:, 0, ON].tolist() == [0, 10, 18]
+    assert told(rate, list(range(40)), said=0.7) and rate.worth == 1.0
+
+
+def test_a_source_that_says_most_or_pairs_of_unsure_geometry_change_nothing() -> None:
+    for said, sure in ((0.9, True), (0.6, True), (0.2, False), (0.0, True)):
+        rate = physics.VoteRate()
+        assert not told(rate, list(range(40)), said, sure) and rate.worth == 1.0
+
+
+@given(seed=seeds)
+def test_the_worth_of_votes_depends_on_no_order(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    said = rng.uniform(0, 0.5, 30)
+    one, other = physics.VoteRate(), physics.VoteRate()
+    for row in range(30):
+        told(one, [row], said[row])
+    for row in rng.integers(0, 30, 50).tolist():  # what they say later replaces it
+        told(other, [row], rng.uniform())
+    for row in rng.permutation(30).tolist():
+        told(other, [row], said[row])
+    assert one.worth == other.worth
+
+
 @pytest.mark.parametrize("count", [0, 3])
 @pytest.mark.parametrize("others", ["riding", "on"])
 def test_votes_are_summed_by_relation(count: int, others: str) -> None:
