@@ -64,7 +64,7 @@ def test_a_stage_that_changed_is_told(fingerprint, room_map, tmp_path):
 
 
 @pytest.mark.models
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(600)
 def test_training_again_gives_the_same_weights(fingerprint, room_map, tmp_path):
     """Also with other sums: other threads, and a processor without vector instructions."""
