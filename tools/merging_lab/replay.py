@@ -45,6 +45,7 @@ from deworldsg_ros.evaluation.recorded_room import open_annotations, read_marked
 from deworldsg_ros.evaluation.runner import to_prediction, translate, translation
 from deworldsg_ros.evaluation.scoring import ProtocolOptions, ScanResult, pool, score_scan
 from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.merging.matching import one_to_one
 from deworldsg_ros.recordings.folders.annotations import Annotations, ScanPoints
 from deworldsg_ros.relations.clips import LiveGraph
 from deworldsg_ros.relations.stage import RelationReasoner, build_world_model
@@ -188,6 +189,7 @@ def replay(capture: Capture, config: Config) -> Replay:
         node_ids.append(builder.integrate(local))
         times_s.append(time.thread_time() - start)
         builder.add_evidence(reasoner.observe(local, NO_IMAGE))
+    builder.find_things()
     followed = [[builder.graph.resolve(node) or 0 for node in row] for row in node_ids]
     return Replay(builder.full(), followed, 1e3 * float(np.median(times_s)))
 
@@ -365,6 +367,8 @@ EDGE_PROBABILITY = 0.5
 # box. Of several objects, the nearest: a hundredth of the distance to the middle decides inside.
 UNNAMED_MARGIN_M = 0.05
 MIDDLE_WEIGHT = 0.01
+# Of the ways to give objects a node each, that with most objects counts, then most right names.
+OBJECT_WORTH, RIGHT_WORTH = 1000.0, 10.0
 
 
 def marked_lines(graph: wire.SceneGraphMessage, marks: Marks, edges: Path | None) -> list[str]:
@@ -375,7 +379,8 @@ def marked_lines(graph: wire.SceneGraphMessage, marks: Marks, edges: Path | None
     found, precision = len(set(right)), len(right) / max(len(rows), 1)
     lines = [
         f"    of {len(marks.objects)} marked objects {found} found, {len(right) - found} "
-        f"duplicates; {len(named)} nodes with a name, precision {precision:.2f}"
+        f"duplicates; {len(named)} nodes with a name, precision {precision:.2f}; "
+        f"{marked_with_node(graph.nodes, marks)} with any node of {len(graph.nodes)}"
     ]
     if edges is None:
         return lines
@@ -415,17 +420,37 @@ def marked_lines(graph: wire.SceneGraphMessage, marks: Marks, edges: Path | None
 
 def nearest_mark(node: wire.NodeState, marks: Marks) -> int | None:
     """Row of the marked object that a node is; None if it has another name, or is elsewhere."""
-    mean, best, least = np.array(node.mean_m), None, np.inf
-    limit_m = marks.margin_m if node.named else UNNAMED_MARGIN_M
-    for row, item in enumerate(marks.objects):
+    best, least = None, marks.margin_m if node.named else UNNAMED_MARGIN_M
+    for row in range(len(marks.objects)):
         if node.named and not marks.is_right(row, node.label):
             continue
-        gap_m = np.linalg.norm(np.maximum(np.maximum(item.low - mean, mean - item.high), 0))
-        middle_m = np.linalg.norm((item.low + item.high) / 2 - mean)
-        distance_m = float(gap_m + MIDDLE_WEIGHT * middle_m)
-        if distance_m < min(least, limit_m):
+        distance_m = _mark_distance(node, marks, row)
+        if distance_m < least:
             best, least = row, distance_m
     return best
+
+
+def marked_with_node(nodes: Sequence[wire.NodeState], marks: Marks) -> int:
+    """Number of marked objects with a node, whatever its name; a node is of one object.
+
+    A right name is preferred, and has the margin of marks; others have that of nodes without one.
+    """
+    worth = np.zeros((len(nodes), len(marks.objects)))
+    for index, node in enumerate(nodes):
+        for row in range(len(marks.objects)):
+            is_right = node.named and marks.is_right(row, node.label)
+            distance_m = _mark_distance(node, marks, row)
+            if distance_m < (marks.margin_m if is_right else UNNAMED_MARGIN_M):
+                worth[index, row] = OBJECT_WORTH + RIGHT_WORTH * is_right - distance_m
+    return sum(row >= 0 for row in one_to_one(worth))
+
+
+def _mark_distance(node: wire.NodeState, marks: Marks, row: int) -> float:
+    """Metres of a node to a box, and a part of those to its middle."""
+    mean, item = np.array(node.mean_m), marks.objects[row]
+    gap_m = np.linalg.norm(np.maximum(np.maximum(item.low - mean, mean - item.high), 0))
+    middle_m = np.linalg.norm((item.low + item.high) / 2 - mean)
+    return float(gap_m + MIDDLE_WEIGHT * middle_m)
 
 
 def _parser() -> argparse.ArgumentParser:
