@@ -295,7 +295,9 @@ class RobustBeliefs:
         wrong = table.contradicted(rows)
         there, back = (_with_none(wrong[:, end])[:, RELATIONS_OF_STATE[:, end]] for end in (0, 1))
         logits = np.where(there | back, CONTRADICTED_LOGIT, logits)
-        near = np.where(wrong[:, :, NEAR].any(axis=1), CONTRADICTED_LOGIT, near)
+        # How other heads vote on the floor was never measured.
+        near[independent, 1] = near[independent, 0]
+        near[wrong[:, :, NEAR].any(axis=1)] = CONTRADICTED_LOGIT
         worth = np.where(independent, model.source_weights[1], 1.0)
         take_in(table.scene, rows, logits, votes, near, worth)
 

@@ -101,7 +101,7 @@ def take_in(
         rows: (k,) of the pairs.
         logits: (k, STATE_COUNT) of their states, from all evidence.
         votes: (k, STATE_COUNT) logits of their states, from votes.
-        near_logits: (k,) that votes add to "near".
+        near_logits: (k, 2) that votes add to "near", on a support and on the floor.
         votes_worth: (k,) exponents of votes.
     """
     weights = np.empty(STATE_COUNT)
@@ -127,12 +127,13 @@ def take_in(
             belief.with_[end] = table * seat * in_seat_reach
             belief.carried[end] = min(belief.carried[end], MOST)
         belief.votes_worth = votes_worth[index]
-        belief.near_votes = votes_worth[index] * near_logits[index]
+        belief.near_votes[0] = votes_worth[index] * near_logits[index, 0]
+        belief.near_votes[1] = votes_worth[index] * near_logits[index, 1]
         apart = belief.judged and np.isinf(belief.gap_m)
-        spoken |= belief.near_votes > 0.0 or belief.other_votes >= MIN_OTHER_VOTES
+        spoken |= belief.near_votes[0] > 0.0 or belief.other_votes >= MIN_OTHER_VOTES
         belief.live = spoken or not apart
         if not belief.live:
-            belief.near = belief.beside = 0.0
+            belief.near = belief.floor_part = belief.beside = 0.0
             belief.relations[:] = 0.0
             belief.relations[:, NONE] = 1.0
 
@@ -213,7 +214,7 @@ def find_neighbours(scene: Scene, slots: Int64) -> Int64:
     """Judge which pairs of some objects (k,) stand side by side on one support.
 
     Args:
-        scene: ``near`` and ``beside`` are written.
+        scene: ``near``, ``floor_part`` and ``beside`` are written.
         slots: (k,) of the objects.
 
     Returns:
@@ -234,7 +235,7 @@ def find_neighbours(scene: Scene, slots: Int64) -> Int64:
             if not belief.known:
                 continue
             now = np.float32(0.0)
-            belief.near = 0.0
+            belief.near = belief.floor_part = 0.0
             if not np.isinf(belief.gap_m):
                 # Probability that the other one rests on the same support.
                 together, at = 0.0, firsts[other]
@@ -255,6 +256,7 @@ def find_neighbours(scene: Scene, slots: Int64) -> Int64:
                 ):
                     together *= 0.5 + 0.5 * math.tanh(0.5 * margin)
                 belief.near = min(floor + together, 1.0)
+                belief.floor_part = floor / max(floor + together, 1e-30)
                 # Whatever else they are called: a chair at a table is the nearest thing of another.
                 now = np.float32(belief.near * (1.0 - belief.kept[0] - belief.kept[1]))
                 now = now if now > MIN_NEIGHBOUR else np.float32(0.0)
@@ -451,10 +453,12 @@ def relate(scene: Scene, slots: Int64, more: Int64) -> Int64:
             now[0, RELATIONS_OF_STATE[state, 0]] += states[state]
             now[1, RELATIONS_OF_STATE[state, 1]] += states[state]
         beside = belief.near * (1.0 - BETWEEN_WORTH * max(belief.between[0], belief.between[1]))
+        votes = belief.near_votes[0]
         if belief.with_[0] + belief.with_[1] == 0:
             beside *= belief.close[0] * belief.close[1]
+            votes += belief.floor_part * (belief.near_votes[1] - votes)
         beside = LEAST_NEAR + (MOST_NEAR - LEAST_NEAR) * beside
-        logit = math.log(beside / (1.0 - beside)) + belief.near_votes
+        logit = math.log(beside / (1.0 - beside)) + votes
         beside = 1.0 / (1.0 + math.exp(-logit))
         is_new = False
         for end in range(2):

@@ -101,17 +101,20 @@ BELIEF = np.dtype(
         ("other_votes", np.float32),
         ("votes_worth", np.float32),
         # By the pair alone: its states; that one end rests on the other; logits that votes add to
-        # "near"; a table and a seat in its reach; false if it is apart and no votes matter.
+        # "near", on a support and on the floor; a table and a seat in its reach; false if it is
+        # apart and no votes matter.
         ("states", np.float32, STATE_COUNT),
         ("carried", np.float64, 2),
-        ("near_votes", np.float32),
+        ("near_votes", np.float32, 2),
         ("with_", np.uint8, 2),
         ("live", np.bool_),
-        # After what others exclude: that one end rests on the other; that both stand side by side;
-        # the same and none carries the other, 0 if it is small; for each end, that the pair is one
-        # of its nearest, and that something beside it stands between.
+        # After what others exclude: that one end rests on the other; that both stand side by side,
+        # and the part of it that is on the floor; the same and none carries the other, 0 if it is
+        # small; for each end, that the pair is one of its nearest, and that something beside it
+        # stands between.
         ("kept", np.float64, 2),
         ("near", np.float32),
+        ("floor_part", np.float32),
         ("beside", np.float32),
         ("close", np.float32, 2),
         ("between", np.float32, 2),

@@ -183,6 +183,30 @@ def test_votes_of_another_relation_head_count_more() -> None:
     assert of("egtr") > of("geometric")
 
 
+CHAIRS = {"a": chair(0, 2), "b": chair(0.7, 2)}
+CUPS = {name: thing("cup", x, 0.1, 0.74, 0.09, 0.09, 0.1) for name, x in (("a", 0), ("b", 0.14))}
+
+
+@pytest.mark.parametrize(
+    "head, things, told",
+    [("geometric", CHAIRS, False), ("geometric", CUPS, True), ("egtr", CHAIRS, True)],
+)
+def test_few_votes_on_near_say_nothing_of_what_stands_on_the_floor(
+    head: str, things: dict[str, Thing], told: bool
+) -> None:
+    """A frame ranks the furniture in its view; what stands nearer may be outside."""
+    builder, ids = room({"table": table(0, 0)} | things, config(head))
+
+    def near() -> float:
+        found = beliefs_of(builder, config(head))[ids["a"], ids["b"]]
+        return float(found[PREDICATES.index("near")])
+
+    before = near()
+    vote(builder, ids["a"], ids["b"], "near", 30, "near", share=0.25)
+    assert before > 0.4
+    assert near() > before + 0.1 if told else near() == pytest.approx(before, abs=0.02)
+
+
 @pytest.mark.parametrize("label, rated", [("chair", False), ("bed", True)])
 def test_silence_on_what_the_relation_head_does_not_rate_says_nothing(
     label: str, rated: bool

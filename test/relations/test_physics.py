@@ -195,7 +195,8 @@ def test_the_evidence_is_that_of_the_formula(seed: int, count: int) -> None:
             ]
             expected = evidence_of(sum(votes) / len(votes), n)
             assert logits[row, state] == pytest.approx(expected, abs=1e-12)
-        expected = evidence_of(counts[row, :, NEAR].mean(), n)
+        on_floor = SCALES._replace(even=physics.EVEN_NEAR_FLOOR)
+        expected = [evidence_of(counts[row, :, NEAR].mean(), n, by) for by in (SCALES, on_floor)]
         assert near[row] == pytest.approx(expected, abs=1e-12)
 
 

@@ -106,7 +106,7 @@ class Followed:
             ends = rng.uniform(0, 1, (2, *self.scene.shapes[low].shape))
             self.scene.shapes[low], self.scene.shapes[high] = np.sort(ends, axis=0)
         self.logits, self.votes = np.zeros((2, len(self.pairs), STATE_COUNT))
-        self.near_logits, self.worth = np.zeros((2, len(self.pairs)))
+        self.near_logits, self.worth = np.zeros((len(self.pairs), 2)), np.zeros(len(self.pairs))
         self.circles: list[set[int]] = []
 
     def change(self, rng: np.random.Generator, rows: np.ndarray) -> None:
@@ -120,7 +120,7 @@ class Followed:
         beliefs["other_votes"][rows] = rng.choice([0.0, MIN_OTHER_VOTES], count)
         self.logits[rows] = np.log(rng.dirichlet(np.full(STATE_COUNT, 0.15), count) + 1e-9)
         self.votes[rows] = rng.choice([-1.0, 0.0, 1.0], (count, STATE_COUNT), p=[0.4, 0.58, 0.02])
-        self.near_logits[rows] = rng.choice([-1.0, 0.0, 0.7], count)
+        self.near_logits[rows] = rng.choice([-1.0, 0.0, 0.7], (count, 2))
         self.worth[rows] = rng.choice([1.0, 2.5], count)
         evidence = (self.logits, self.votes, self.near_logits, self.worth)
         rules.take_in(self.scene, rows, *(values[rows] for values in evidence))
@@ -147,13 +147,15 @@ class Followed:
             softmax(self.logits, axis=1), self.pairs, shapes["floor_odds"]
         )
         apart = beliefs["judged"] & np.isinf(beliefs["gap_m"])
-        told = (self.votes > 0).any(axis=1) | (self.near_logits > 0)
+        told = (self.votes > 0).any(axis=1) | (self.near_logits[:, 0] > 0)
         live = told | (beliefs["other_votes"] >= MIN_OTHER_VOTES) | ~apart
         tables, seats = (shapes["seating"][self.pairs, kind] > 0 for kind in range(2))
         with_ = (tables & seats[:, ::-1]).any(axis=1) & beliefs["judged"]
         with_ &= beliefs["gap_m"] <= rules.SEAT_GAP_M
-        near = near_probabilities(self.pairs, kept, shapes, on_floor, beliefs, with_)
-        near = expit(logit(near) + self.worth * self.near_logits)
+        near, floor = near_probabilities(self.pairs, kept, shapes, on_floor, beliefs, with_)
+        floor = np.where(with_, 0.0, floor)
+        votes = (self.near_logits * np.column_stack([1.0 - floor, floor])).sum(axis=1)
+        near = expit(logit(near) + self.worth * votes)
         relations = np.zeros((len(self.pairs), 2, NONE + 1))
         for end in (0, 1):
             for state in range(1, STATE_COUNT):

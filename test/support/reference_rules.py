@@ -78,12 +78,12 @@ def near_probabilities(
     on_floor: Float64,
     beliefs: NDArray[np.void],
     table_and_seat: Bool,
-) -> Float64:
+) -> tuple[Float64, Float64]:
     """Probability that two objects are near, if no more specific relation holds, before the votes.
 
     Both stand on one support, within reach, and not in one place; each is among the nearest
     neighbours of the other, and no neighbour stands between. `beliefs` has the measured geometry of
-    the pairs.
+    the pairs. Also the part of standing side by side that is on the floor.
     """
     supports = np.zeros((len(on_floor), len(on_floor)))
     first, second = pairs.T
@@ -98,6 +98,7 @@ def near_probabilities(
     together *= expit((OVERLAP_M + beliefs["gap_m"]) / OVERLAP_SPREAD_M)
     near = np.minimum(on_one_floor + together, 1.0)
     near[np.isinf(gaps_m)] = 0.0
+    floor_part = np.where(near > 0, on_one_floor / np.maximum(on_one_floor + together, 1e-30), 0.0)
     beside = near * (1.0 - carried.sum(axis=1))
     beside[beside <= MIN_NEIGHBOUR] = 0.0
     distances_m = gaps_m + CENTRE_FRACTION * beliefs["centre_step_m"]
@@ -114,7 +115,7 @@ def near_probabilities(
                 between[row, end] = max([*(beside[others] * ways), 0.0])
     near *= 1.0 - BETWEEN_WORTH * between.max(axis=1, initial=0.0)
     near *= np.where(table_and_seat, 1.0, close.prod(axis=1))
-    return np.asarray(LEAST_NEAR + (MOST_NEAR - LEAST_NEAR) * near)
+    return LEAST_NEAR + (MOST_NEAR - LEAST_NEAR) * near, floor_part
 
 
 def covered(one: np.void, other: np.void, third: np.void) -> float:
