@@ -41,10 +41,10 @@ from deworldsg_ros.scene.vocabulary import KINDS, fixed_table, kind_table
 # Relations of each state in both directions, and how many of them have a name.
 _STATES = RELATIONS_OF_STATE
 _NAMED = (_STATES != NONE).sum(axis=1).astype(np.float64)
-# Fraction of votes on "near" that is no evidence, of pairs on the floor. A frame ranks neighbours
-# among the furniture in its view, and has the errors of the fused gaps: a quarter of the frames say
-# "near" of pairs that look near and are not (chosen on ten simulated rooms).
-EVEN_NEAR_FLOOR = 0.25
+# What a vote on "near" is worth, of pairs on the floor. A frame ranks neighbours among the
+# furniture in its view, and its gaps have errors: a quarter of the frames say "near" of pairs that
+# look near and are not (chosen on ten simulated rooms). Silence says as much as elsewhere.
+NEAR_FLOOR_WORTH = 1.0 / 3.0
 
 
 class VoteScales(NamedTuple):
@@ -123,7 +123,8 @@ def _vote_logits(
                 logits[row, state] = evidence
             else:
                 near[row, 0] = evidence
-                near[row, 1] = worth * math.log((fraction + floor) / (EVEN_NEAR_FLOOR + floor))
+                weighed = NEAR_FLOOR_WORTH * fraction
+                near[row, 1] = worth * math.log((weighed + floor) / (even + floor))
     return logits, near
 
 

@@ -195,8 +195,8 @@ def test_the_evidence_is_that_of_the_formula(seed: int, count: int) -> None:
             ]
             expected = evidence_of(sum(votes) / len(votes), n)
             assert logits[row, state] == pytest.approx(expected, abs=1e-12)
-        on_floor = SCALES._replace(even=physics.EVEN_NEAR_FLOOR)
-        expected = [evidence_of(counts[row, :, NEAR].mean(), n, by) for by in (SCALES, on_floor)]
+        votes = counts[row, :, NEAR].mean()
+        expected = [evidence_of(votes * by, n) for by in (1.0, physics.NEAR_FLOOR_WORTH)]
         assert near[row] == pytest.approx(expected, abs=1e-12)
 
 
