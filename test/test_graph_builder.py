@@ -105,7 +105,7 @@ def test_names_may_come_at_any_time(relations: RelationsConfig, tmp_path: Path) 
         vocabulary = Vocabulary(tuple(everything[name] for name in names), predicates)
         known = np.zeros((2, count))
         known[:, names] = classes
-        fields = {"points": points, "pairs": [(0, 1)], "logits": np.array([[0.0, 4.0, 0.0]])}
+        fields = {"points": points, "pairs": [(0, 1)], "logits": np.array([[4.0, 0.0, 0.0]])}
         boxes = stamp + 1, means, np.tile(0.003 * np.eye(3), (2, 1, 1))
         local = local_graph(*boxes, classes, vocabulary=vocabulary, **fields)
         for one, frame in ((builder, local), (knowing, local_graph(*boxes, known,

@@ -247,7 +247,7 @@ class RobustBeliefs:
         return self._beliefs(changed, rows[~known], prior)
 
     def _learn_rate(self, rows: Int64) -> bool:
-        """Learn how often the source speaks; whether its votes are worth more or less now."""
+        """Learn how often the source speaks; returns whether the worth of its votes changed."""
         pairs, beliefs = self._graph.pairs, self._table.beliefs.take(rows)
         counts, _ = relation_counts(pairs.counts(rows), self._names.relation_of)
         logits = self._model.source_weights[0] * beliefs["state_logits"].astype(np.float64)
@@ -295,8 +295,8 @@ class RobustBeliefs:
         wrong = table.contradicted(rows)
         there, back = (_with_none(wrong[:, end])[:, RELATIONS_OF_STATE[:, end]] for end in (0, 1))
         logits = np.where(there | back, CONTRADICTED_LOGIT, logits)
-        # How other heads vote on the floor was never measured.
-        near[independent, 1] = near[independent, 0]
+        if not self._own_head:  # how others vote on the floor was never measured
+            near[:, 1] = near[:, 0]
         near[wrong[:, :, NEAR].any(axis=1)] = CONTRADICTED_LOGIT
         worth = np.where(independent, model.source_weights[1], 1.0)
         take_in(table.scene, rows, logits, votes, near, worth)

@@ -41,9 +41,9 @@ from deworldsg_ros.scene.vocabulary import KINDS, fixed_table, kind_table
 # Relations of each state in both directions, and how many of them have a name.
 _STATES = RELATIONS_OF_STATE
 _NAMED = (_STATES != NONE).sum(axis=1).astype(np.float64)
-# What a vote on "near" is worth, of pairs on the floor. A frame ranks neighbours among the
+# A vote on "near" counts this much for pairs on the floor. A frame ranks neighbours among the
 # furniture in its view, and its gaps have errors: a quarter of the frames say "near" of pairs that
-# look near and are not (chosen on ten simulated rooms). Silence says as much as elsewhere.
+# look near and are not (chosen on ten simulated rooms). No votes say as much as elsewhere.
 NEAR_FLOOR_WORTH = 1.0 / 3.0
 
 
@@ -139,7 +139,7 @@ FITTED_RATE = 0.6
 SURE, MIN_FRAMES, MIN_FRACTION = 0.9, 5, 0.05
 # The rate starts as the fitted one, with the weight of this many pairs.
 PRIOR_PAIRS = 5
-# Steps of the worth of a vote, so that it changes seldom: every change concerns all pairs.
+# Steps of the worth of a vote. A change concerns all pairs: they are taken in anew, in one call.
 WORTH_STEP = 0.25
 # Sums of whole numbers of this are exact: taking one back leaves no trace, and the order does not
 # matter.
@@ -174,7 +174,7 @@ class VoteRate:
             frames: (m,) number of frames that showed both objects.
 
         Returns:
-            Whether the worth of all votes is another one.
+            Whether the worth of a vote changed.
         """
         said = counts[:, :, :NEAR].sum(axis=(1, 2)) / np.maximum(frames, 1)
         related = 1.0 - np.exp(logits[:, 0] - np.logaddexp.reduce(logits, axis=1))
@@ -191,10 +191,9 @@ class VoteRate:
         return self.worth != before
 
     def worthy(self, counts: Float64, frames: Int64) -> Float64:
-        """Votes (m, 2, NONE) as if the source had the fitted rate; none exceeds it by this."""
+        """Votes (m, 2, NONE) times their worth. This lifts no vote above the fitted rate."""
         most = np.maximum(counts, FITTED_RATE * frames[:, None, None])
-        scaled: Float64 = np.minimum(self.worth * counts, most)
-        return scaled
+        return np.asarray(np.minimum(self.worth * counts, most))
 
 
 assert len(RELATIONS) == NONE + 1

@@ -108,10 +108,10 @@ BELIEF = np.dtype(
         ("near_votes", np.float32, 2),
         ("with_", np.uint8, 2),
         ("live", np.bool_),
-        # After what others exclude: that one end rests on the other; that both stand side by side,
-        # and the part of it that is on the floor; the same and none carries the other, 0 if it is
-        # small; for each end, that the pair is one of its nearest, and that something beside it
-        # stands between.
+        # After what others exclude: that one end rests on the other; that both stand side by side;
+        # the part of this that is on the floor; that both stand side by side and none carries the
+        # other, 0 if it is small; for each end, that the pair is one of its nearest, and that
+        # something beside it stands between.
         ("kept", np.float64, 2),
         ("near", np.float32),
         ("floor_part", np.float32),

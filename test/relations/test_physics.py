@@ -217,6 +217,8 @@ def test_votes_of_a_source_that_leaves_much_out_are_worth_more() -> None:
     # Silence stays silence, and no vote is worth less than before.
     assert rate.worthy(counts, frames)[:, 0, ON].tolist() == [0, 10, 18]
     assert told(rate, list(range(40)), said=0.7) and rate.worth == 1.0
+    assert told(rate, list(range(40)), said=0.2) and rate.worth == 2.5
+    assert told(rate, list(range(40)), said=0.2, sure=False) and rate.worth == 1.0  # they left
 
 
 def test_a_source_that_says_most_or_pairs_of_unsure_geometry_change_nothing() -> None:

@@ -367,8 +367,6 @@ EDGE_PROBABILITY = 0.5
 # box. Of several objects, the nearest: a hundredth of the distance to the middle decides inside.
 UNNAMED_MARGIN_M = 0.05
 MIDDLE_WEIGHT = 0.01
-# Of the ways to give objects a node each, that with most objects counts, then most right names.
-OBJECT_WORTH, RIGHT_WORTH = 1000.0, 10.0
 
 
 def marked_lines(graph: wire.SceneGraphMessage, marks: Marks, edges: Path | None) -> list[str]:
@@ -380,7 +378,7 @@ def marked_lines(graph: wire.SceneGraphMessage, marks: Marks, edges: Path | None
     lines = [
         f"    of {len(marks.objects)} marked objects {found} found, {len(right) - found} "
         f"duplicates; {len(named)} nodes with a name, precision {precision:.2f}; "
-        f"{marked_with_node(graph.nodes, marks)} with any node of {len(graph.nodes)}"
+        f"{marked_with_node(graph.nodes, marks)} objects have one of all {len(graph.nodes)} nodes"
     ]
     if edges is None:
         return lines
@@ -433,15 +431,14 @@ def nearest_mark(node: wire.NodeState, marks: Marks) -> int | None:
 def marked_with_node(nodes: Sequence[wire.NodeState], marks: Marks) -> int:
     """Number of marked objects with a node, whatever its name; a node is of one object.
 
-    A right name is preferred, and has the margin of marks; others have that of nodes without one.
+    A node with a right name has the margin of marks, any other that of nodes without a name.
     """
     worth = np.zeros((len(nodes), len(marks.objects)))
     for index, node in enumerate(nodes):
         for row in range(len(marks.objects)):
             is_right = node.named and marks.is_right(row, node.label)
-            distance_m = _mark_distance(node, marks, row)
-            if distance_m < (marks.margin_m if is_right else UNNAMED_MARGIN_M):
-                worth[index, row] = OBJECT_WORTH + RIGHT_WORTH * is_right - distance_m
+            margin_m = marks.margin_m if is_right else UNNAMED_MARGIN_M
+            worth[index, row] = _mark_distance(node, marks, row) < margin_m
     return sum(row >= 0 for row in one_to_one(worth))
 
 
