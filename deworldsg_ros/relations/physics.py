@@ -133,9 +133,9 @@ def _vote_logits(
 # The formula was fitted to votes of the embedded head. Of pairs that are related, this fraction of
 # their frames says so.
 FITTED_RATE = 0.6
-# A pair tells the rate of a source if its geometry is sure, by this, that it is related, if so many
-# frames showed it, and if more than this fraction of them voted. Where nobody votes, the geometry
-# may be wrong.
+# The rate of a source is learned from pairs that are related with more than `SURE`, by their
+# geometry alone. At least `MIN_FRAMES` have shown them, with more than `MIN_FRACTION` votes a
+# frame. Pairs without votes do not count: their geometry may be wrong.
 SURE, MIN_FRAMES, MIN_FRACTION = 0.9, 5, 0.05
 # The rate starts as the fitted one, with the weight of this many pairs.
 PRIOR_PAIRS = 5
