@@ -192,6 +192,8 @@ class VoteRate:
 
     def worthy(self, counts: Float64, frames: Int64) -> Float64:
         """Votes (m, 2, NONE) times their worth. This lifts no vote above the fitted rate."""
+        if self.worth == 1.0:
+            return counts
         most = np.maximum(counts, FITTED_RATE * frames[:, None, None])
         return np.asarray(np.minimum(self.worth * counts, most))
 
